@@ -3,9 +3,10 @@
 import numpy as np
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.geometry import se3_exp, transform_points
+from segfloor_ros.core.geometry import transform_points
 from segfloor_ros.core.slam.mapping.bundle_adjustment import BundleProblem
 from segfloor_ros.core.slam.rig import Observations
+from segfloor_ros.core.twists import se3_exp
 
 CAMERA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.12)
 

@@ -11,7 +11,7 @@ from stereo_room import CAMERA, StereoRoom, planar_pose
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.core.pipeline import Pipeline
+from segfloor_ros.core.plugins.assembly import make_pipeline
 from segfloor_ros.nodes.configuration import resolve
 
 RATE_HZ = 10.0
@@ -53,7 +53,7 @@ def lockstep_map(recording: Path) -> OccupancyGrid:
     """Return the map of a recording by the pipeline without ROS."""
     configuration = resolve(assignments=[f'stereo_camera.input={recording}'])
     source = open_source(configuration.stereo_camera)
-    pipeline = Pipeline(source.camera, configuration)
+    pipeline = make_pipeline(source.camera, configuration)
     for frame in source.frames():
         pipeline.process(frame)
     grid = pipeline.finish()

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.core.geometry import HISTORY_NS, between, make_transform, rotation_angle
+from segfloor_ros.core.geometry import HISTORY_NS, make_transform, rotation_angle
+from segfloor_ros.core.twists import between
 from segfloor_ros.nodes.frame_tree import FrameTree
 
 S = 1_000_000_000

@@ -36,7 +36,7 @@ from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.grid.mapper import OccupancyGridMapper
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.core.pipeline import make_slam
+from segfloor_ros.core.plugins.assembly import make_slam
 from segfloor_ros.nodes.configuration import resolve
 from tools.driving import noisy
 from tools.mechanisms import FLOOR as FLOOR_MECHANISMS

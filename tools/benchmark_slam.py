@@ -17,7 +17,7 @@ from segfloor_ros.apps.cli.main import run_command
 from segfloor_ros.apps.cli.terminal import Announce, announcing, console, figure_table
 from segfloor_ros.apps.trajectory import read_trajectory
 from segfloor_ros.core.configuration import Configuration
-from segfloor_ros.core.pipeline import Pipeline
+from segfloor_ros.core.plugins.assembly import make_pipeline
 from segfloor_ros.nodes.configuration import resolve
 from tools.driving import open_recording, recordings
 from tools.endless_drive import write_endless_drive
@@ -85,7 +85,7 @@ def _soak(
         path = write_endless_drive(source, Path(folder) / 'drive', 60 * minutes, rate_hz=rate_hz)
         endless = open_recording(path, configuration)
         report = announce(f'soaking {name}', endless.frame_count or 0)
-        pipeline = Pipeline(endless.camera, configuration)
+        pipeline = make_pipeline(endless.camera, configuration)
         return Soak(pipeline, endless, truth).run(report)
 
 

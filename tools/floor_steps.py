@@ -19,7 +19,7 @@ from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.errors import MapError
 from segfloor_ros.core.floor.segmentation import DISPARITY, DISPARITY_ABOVE, FloorSegmentation
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.pipeline import make_slam
+from segfloor_ros.core.plugins.assembly import make_slam
 from segfloor_ros.core.timing import StageTimes
 from tools.driving import drive, open_recording
 

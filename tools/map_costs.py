@@ -19,9 +19,9 @@ from rich.console import Console
 from rich.table import Table
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.files.results import Arrays
-from segfloor_ros.core.geometry import Array, invert, se3_exp
-from segfloor_ros.core.plugins.saved_slam import fill_map
+from segfloor_ros.core.files.arrays import Arrays
+from segfloor_ros.core.geometry import Array, invert
+from segfloor_ros.core.plugins.maps.map_arrays import fill_map
 from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     apply_global,
     copy_map,
@@ -35,6 +35,7 @@ from segfloor_ros.core.slam.rig import NO_OFFSET, Rig
 from segfloor_ros.core.slam.sparse_map import Match, SparseMap
 from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.patch_alignment import SIDE_PX
+from segfloor_ros.core.twists import se3_exp
 
 CAMERA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.12)
 STEP_M, SEEN_BY, POINTS = 0.1, 6, 50

@@ -80,125 +80,144 @@ def _begun_anywhere(view: Any, mask: Any, alike: Any, may_begin: Any, *others: A
 
 SLAM: dict[str, Mechanism] = {
     NOTHING: Mechanism(),
-    'deblocking': Mechanism({'camera.calibration.parameters.deblocked': _first}),
-    'fusion of points': Mechanism({'slam.mapping.keyframe_mapping.fuse_duplicates': _none}),
+    'deblocking': Mechanism({'core.camera.calibration.deblocked': _first}),
+    'fusion of points': Mechanism({'core.slam.mapping.keyframe_mapping.fuse_duplicates': _none}),
     'place keyframes in the local map': Mechanism(
-        {'slam.tracking.map_tracking.views_near': _no_rows}
+        {'core.slam.tracking.map_tracking.views_near': _no_rows}
     ),
-    'alignment of patches': Mechanism({'slam.tracking.map_tracking.align_pixels': _none}),
-    'following between keyframes': Mechanism({'slam.tracking.map_tracking.Follower.follow': _none}),
-    'disparity offset': Mechanism({'slam.rig.OFFSET_SIGMA_PX': 0.0}),
-    'bad adjustments left out': Mechanism({'slam.mapping.keyframe_mapping.MAJORITY': 0.0}),
-    'known views': Mechanism({'slam.places.views.NEARLY_ALL': 2.0}),
-    'retiring of keyframes': Mechanism({'slam.mapping.keyframe_mapping.retire_redundant': _none}),
-    'keyframes where few points are found': Mechanism({'slam.places.views.MAJORITY': 0.0}),
-    'loops': Mechanism({'slam.mapping.back_end.BackEnd._close_loop': lambda *_: False}),
-    'whole map adjusted after some loops alone': Mechanism({'slam.mapping.back_end.GROWN': 0.0}),
+    'alignment of patches': Mechanism({'core.slam.tracking.map_tracking.align_pixels': _none}),
+    'following between keyframes': Mechanism(
+        {'core.slam.tracking.map_tracking.Follower.follow': _none}
+    ),
+    'disparity offset': Mechanism({'core.slam.rig.OFFSET_SIGMA_PX': 0.0}),
+    'bad adjustments left out': Mechanism({'core.slam.mapping.keyframe_mapping.MAJORITY': 0.0}),
+    'known views': Mechanism({'core.slam.places.views.NEARLY_ALL': 2.0}),
+    'retiring of keyframes': Mechanism(
+        {'core.slam.mapping.keyframe_mapping.retire_redundant': _none}
+    ),
+    'keyframes where few points are found': Mechanism({'core.slam.places.views.MAJORITY': 0.0}),
+    'loops': Mechanism({'core.slam.mapping.back_end.BackEnd._close_loop': lambda *_: False}),
+    'whole map adjusted after some loops alone': Mechanism(
+        {'core.slam.mapping.back_end.GROWN': 0.0}
+    ),
     'the map stays where its first keyframes came': Mechanism(
-        {'slam.mapping.bundle_adjustment._brought_back': lambda *_: np.eye(4)}
+        {'core.slam.mapping.bundle_adjustment._brought_back': lambda *_: np.eye(4)}
     ),
-    'places by their floor': Mechanism({'slam.places.loops.PlaceMatcher.look_at_floor': _none}),
-    'relocalisation by several frames': Mechanism({'slam.places.place_recognition.PROOF': 1}),
-    'map parts': Mechanism({'slam.stereo_slam.LOST_NS': 1 << 62}),
+    'places by their floor': Mechanism(
+        {'core.slam.places.loops.PlaceMatcher.look_at_floor': _none}
+    ),
+    'relocalisation by several frames': Mechanism({'core.slam.places.place_recognition.PROOF': 1}),
+    'map parts': Mechanism({'core.slam.stereo_slam.LOST_NS': 1 << 62}),
     'two motions distinguished': Mechanism(
-        {'slam.tracking.pose.differ': lambda a, b: False, 'slam.tracking.pose.KNOWN_NOISE': 1e9}
+        {
+            'core.slam.tracking.pose.differ': lambda a, b: False,
+            'core.slam.tracking.pose.KNOWN_NOISE': 1e9,
+        }
     ),
-    'motion so far': Mechanism({'slam.tracking.front_end.FrontEnd._carry_on': lambda *a: a[-1]}),
+    'motion so far': Mechanism(
+        {'core.slam.tracking.front_end.FrontEnd._carry_on': lambda *a: a[-1]}
+    ),
     'images weighed against wheels': Mechanism(
-        {'slam.tracking.front_end.FrontEnd._weighed': lambda self, track, images: track}
+        {'core.slam.tracking.front_end.FrontEnd._weighed': lambda self, track, images: track}
     ),
-    'bias of the gyroscope at rest': Mechanism({'slam.sensors.body_motion.AT_REST': (-1.0, -1.0)}),
+    'bias of the gyroscope at rest': Mechanism(
+        {'core.plugins.sensors.body_motion.AT_REST': (-1.0, -1.0)}
+    ),
     'offset of the camera once it is known': Mechanism(
-        {'slam.sensors.wheel_odometry.KNOWN_M': np.inf}
+        {'core.plugins.sensors.wheel_odometry.KNOWN_M': np.inf}
     ),
-    'begin again': Mechanism({'slam.stereo_slam.HARDLY_BEGUN': -1}),
-    'scene flow': Mechanism({'slam.moving.scene_flow.SceneFlow._earlier': lambda *_: []}),
-    'points seen through': Mechanism({'slam.sparse_map.PROOF': 1 << 30}),
+    'begin again': Mechanism({'core.slam.stereo_slam.HARDLY_BEGUN': -1}),
+    'scene flow': Mechanism({'core.plugins.moving.scene_flow.SceneFlow._earlier': lambda *_: []}),
+    'points seen through': Mechanism({'core.slam.sparse_map.PROOF': 1 << 30}),
     'search for what moves': Mechanism(settings={'detect_moving': False}),
 }
 """What makes the path."""
 
 FLOOR: dict[str, Mechanism] = {
     NOTHING: Mechanism(),
-    'a bend needs a measurement': Mechanism({'floor.disparity.profile._LINE_ITERATIONS': -1}),
+    'a bend needs a measurement': Mechanism({'core.floor.disparity.profile._LINE_ITERATIONS': -1}),
     'level expectation': Mechanism(
         {
-            'floor.segmentation.expectations': lambda mount, _: np.array(
+            'core.floor.segmentation.expectations': lambda mount, _: np.array(
                 [[mount.pitch_rad, mount.roll_rad, mount.height_m]]
             )
         }
     ),
     'swings over bumps': Mechanism(
-        {'floor.plane.plane.swung': lambda angles_height, _: np.zeros((0, len(angles_height)))}
+        {'core.floor.plane.plane.swung': lambda angles_height, _: np.zeros((0, len(angles_height)))}
     ),
-    'guard at the right border': Mechanism({'floor.segmentation._BORDER_BLOCKS': 0}),
+    'guard at the right border': Mechanism({'core.floor.segmentation._BORDER_BLOCKS': 0}),
     'floor up to contacts': Mechanism(
-        {'floor.mask.filling.fill_to_contact': lambda view, mask, alike, *_: _nowhere(alike)}
+        {'core.floor.mask.filling.fill_to_contact': lambda view, mask, alike, *_: _nowhere(alike)}
     ),
     'what the image cuts off looks like floor': Mechanism(
-        {'floor.mask.filling.fill_to_contact': _begun_anywhere}
+        {'core.floor.mask.filling.fill_to_contact': _begun_anywhere}
     ),
     'contacts with what has texture alone': Mechanism(
-        {'floor.segmentation.upright_above': _above_anything}
+        {'core.floor.segmentation.upright_above': _above_anything}
     ),
     'feet of blank faces': Mechanism(
-        {'floor.segmentation.blank_feet': lambda *_: (np.zeros(0, np.float32), _no_rows())}
+        {'core.floor.segmentation.blank_feet': lambda *_: (np.zeros(0, np.float32), _no_rows())}
     ),
-    'narrow gaps closed': Mechanism({'floor.scan._NARROW_M': 0.0}),
-    'noise stands nowhere': Mechanism({'floor.segmentation._LEAST_SHARE': 0.0}),
-    'boards count twice': Mechanism({'floor.segmentation._BOARD': 1}),
+    'narrow gaps closed': Mechanism({'core.floor.scan._NARROW_M': 0.0}),
+    'noise stands nowhere': Mechanism({'core.floor.segmentation._LEAST_SHARE': 0.0}),
+    'boards count twice': Mechanism({'core.floor.segmentation._BOARD': 1}),
     'filling of regions': Mechanism(
-        {'floor.segmentation.fill_regions': lambda view, mask, *_: mask}
+        {'core.floor.segmentation.fill_regions': lambda view, mask, *_: mask}
     ),
     'filling of gaps': Mechanism(
-        {'floor.segmentation.fill_gaps': lambda view, profile, mask, *_: mask}
+        {'core.floor.segmentation.fill_gaps': lambda view, profile, mask, *_: mask}
     ),
-    'islands dropped': Mechanism({'floor.segmentation.drop_islands': _first}),
+    'islands dropped': Mechanism({'core.floor.segmentation.drop_islands': _first}),
     'looks of the floor': Mechanism(
-        {'floor.segmentation.unlike_floor': lambda image, floor: _nowhere(image)}
+        {'core.floor.segmentation.unlike_floor': lambda image, floor: _nowhere(image)}
     ),
     'texture that is not of the floor': Mechanism(
-        {'floor.mask.pixel_evidence._foreign': lambda left, *_: _nowhere(left)}
+        {'core.floor.mask.pixel_evidence._foreign': lambda left, *_: _nowhere(left)}
     ),
     'most of what is measured around': Mechanism(
-        {'floor.mask.pixel_evidence.most_around': lambda said, _: ~_nowhere(said)}
+        {'core.floor.mask.pixel_evidence.most_around': lambda said, _: ~_nowhere(said)}
     ),
     'what stands beside the left border': Mechanism(
-        {'floor.segmentation.beside_something': lambda view, mask: _nowhere(mask)}
+        {'core.floor.segmentation.beside_something': lambda view, mask: _nowhere(mask)}
     ),
     'floor beside the profile': Mechanism(
-        {'floor.segmentation.lies_on_floor': lambda view, disparity, _: _nowhere(disparity)}
+        {'core.floor.segmentation.lies_on_floor': lambda view, disparity, _: _nowhere(disparity)}
     ),
     'what stands is not filled': Mechanism(
-        {'floor.segmentation.fill_regions': _filled_whatever_stands}
+        {'core.floor.segmentation.fill_regions': _filled_whatever_stands}
     ),
-    'trimming to edges': Mechanism({'floor.segmentation.trim_to_edges': _first}),
+    'trimming to edges': Mechanism({'core.floor.segmentation.trim_to_edges': _first}),
     'what hangs at the height of the robot': Mechanism(
-        {'floor.scan.OverheadMatcher.positions': lambda *_, **__: np.zeros((2, 0), np.float32)}
+        {'core.floor.scan.OverheadMatcher.positions': lambda *_, **__: np.zeros((2, 0), np.float32)}
     ),
     'boards known by their ends': Mechanism(
-        {'floor.scan._with_boards': lambda disparity, known, telling: telling}
+        {'core.floor.scan._with_boards': lambda disparity, known, telling: telling}
     ),
 }
 """What makes the masks and the floor scan."""
 
 GRID: dict[str, Mechanism] = {
-    'ray limit Q3 + 1.5 IQR': Mechanism({'grid.keyframe_evidence.ray_length_limit': lambda _: 1e9}),
-    'rays shortened': Mechanism({'grid.keyframe_evidence._certain': _first}),
-    'partly free edges': Mechanism(
-        {'grid.keyframe_evidence.Fan.edges': lambda self: _nowhere(self.lengths)}
+    'ray limit Q3 + 1.5 IQR': Mechanism(
+        {'core.grid.keyframe_evidence.ray_length_limit': lambda _: 1e9}
     ),
-    'evidence ends where it is sure': Mechanism({'grid.mapper.MOST': 2.8}),
-    'dilation of hits': Mechanism({'grid.mapper._AROUND': np.ones((1, 1), np.uint8)}),
-    'slant': Mechanism({'grid.keyframe_evidence.slant': lambda range_m, _: np.ones(len(range_m))}),
+    'rays shortened': Mechanism({'core.grid.keyframe_evidence._certain': _first}),
+    'partly free edges': Mechanism(
+        {'core.grid.keyframe_evidence.Fan.edges': lambda self: _nowhere(self.lengths)}
+    ),
+    'evidence ends where it is sure': Mechanism({'core.grid.mapper.MOST': 2.8}),
+    'dilation of hits': Mechanism({'core.grid.mapper._AROUND': np.ones((1, 1), np.uint8)}),
+    'slant': Mechanism(
+        {'core.grid.keyframe_evidence.slant': lambda range_m, _: np.ones(len(range_m))}
+    ),
     'nothing free right behind faces': Mechanism(
         {
-            'grid.mapper.EvidenceFolder._draw_behind': lambda self, shape, placed: np.zeros(
+            'core.grid.mapper.EvidenceFolder._draw_behind': lambda self, shape, placed: np.zeros(
                 shape, np.uint8
             )
         }
     ),
-    'shadows of what stands': Mechanism({'grid.keyframe_evidence.Fan.shadow': _none}),
+    'shadows of what stands': Mechanism({'core.grid.keyframe_evidence.Fan.shadow': _none}),
 }
 """What makes the map of masks, scans and points."""
 

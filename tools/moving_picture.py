@@ -26,7 +26,7 @@ from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, FloorObservation, Ke
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.grid.occupancy import UNKNOWN, OccupancyGrid
-from segfloor_ros.core.pipeline import Pipeline
+from segfloor_ros.core.plugins.assembly import make_pipeline
 from segfloor_ros.nodes.configuration import resolve
 
 Picture = NDArray[np.uint8]
@@ -52,7 +52,7 @@ def moving_picture(
         if grid is not None:
             views.append((tinted(keyframe.left, floor.mask), grid, keyframe.path.T_map_base))
 
-    pipeline = Pipeline(source.camera, configuration, take)
+    pipeline = make_pipeline(source.camera, configuration, take)
     for frame in track(source.frames(), 'mapping', total=source.frame_count, console=console):
         pipeline.process(frame)
     pipeline.finish_tracking()

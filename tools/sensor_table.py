@@ -25,7 +25,7 @@ from segfloor_ros.apps.simulation.scene_file import open_scene
 from segfloor_ros.apps.simulation.simulation import render_once
 from segfloor_ros.apps.trajectory import TrackedPose, corrected_trajectory
 from segfloor_ros.core.contracts import FrameResult, KeyframePath
-from segfloor_ros.core.pipeline import Pipeline, make_slam
+from segfloor_ros.core.plugins.assembly import make_pipeline, make_slam
 from segfloor_ros.nodes.configuration import resolve
 from tools.driving import after_sensors, open_recording
 
@@ -120,7 +120,7 @@ def measure(
     """Drive a recording without some of its sensors."""
     configuration = resolve(stereo_camera={'input': str(recording), 'ignore': ignored})
     source = open_recording(recording, configuration)
-    pipeline = Pipeline(source.camera, configuration) if with_map else None
+    pipeline = make_pipeline(source.camera, configuration) if with_map else None
     slam = pipeline.slam if pipeline else make_slam(source.camera, configuration.stereo_slam)
     results: list[FrameResult] = []
     path: KeyframePath | None = None

@@ -23,11 +23,15 @@ from segfloor_ros.apps.evaluation.maps import load_truth, resample
 from segfloor_ros.apps.simulation.scene_file import scene_from_mapping
 from segfloor_ros.apps.simulation.simulation import render_once
 from segfloor_ros.core.contracts import FrameResult
-from segfloor_ros.core.files.results import MapFile, read_map_file, write_map_file
+from segfloor_ros.core.files.arrays import MapFile
+from segfloor_ros.core.files.results import read_map_file, write_map_file
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, OccupancyGrid
-from segfloor_ros.core.pipeline import Pipeline, prune
-from segfloor_ros.core.plugins.saved_slam import fill_map
+from segfloor_ros.core.pipeline import Pipeline
+from segfloor_ros.core.plugins.assembly import make_pipeline
+from segfloor_ros.core.plugins.maps.map_arrays import fill_map
+from segfloor_ros.core.plugins.maps.pruning import prune
+from segfloor_ros.core.plugins.maps.saved_slam import load_pipeline, save_pipeline
 from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.core.slam.rig import Rig
@@ -119,11 +123,11 @@ def drive_session(drive: Path, saved: MapFile | None, first: Path) -> tuple[MapF
     """
     configuration = resolve(None, ())
     source = open_recording(drive, configuration)
-    pipeline, query_ms = Pipeline(source.camera, configuration), float('nan')
+    pipeline, query_ms = make_pipeline(source.camera, configuration), float('nan')
     results: list[FrameResult] = []
     with contextlib.closing(pipeline):
         if saved is not None:
-            pipeline.load(saved, 'map', False)
+            load_pipeline(pipeline, saved, 'map', False)
         frames = list(source.frames())
         if saved is not None:
             query_ms = _query_ms(pipeline, saved, frames)
@@ -132,7 +136,7 @@ def drive_session(drive: Path, saved: MapFile | None, first: Path) -> tuple[MapF
         results += pipeline.finish_tracking()
         grid = pipeline.finish()
         is_known = pipeline.slam.back_end.submap is not Submap.OUTSIDE
-        after = pipeline.save() if is_known or saved is None else saved
+        after = save_pipeline(pipeline) if is_known or saved is None else saved
     assert grid is not None
     errors = _errors_m(results, drive, first)
     tracked = np.isfinite(errors)
@@ -149,7 +153,7 @@ def drive_session(drive: Path, saved: MapFile | None, first: Path) -> tuple[MapF
 
 def _query_ms(pipeline: Pipeline, saved: MapFile, frames: list[Any]) -> float:
     """Return how long a place is looked for, in the median of some frames."""
-    sparse_map = SparseMap(Rig(pipeline.camera, None))
+    sparse_map = SparseMap(Rig(pipeline.slam.rig.camera, None))
     fill_map(sparse_map, saved.parts['slam'])
     places = PlaceRecognition(sparse_map)
     places.from_arrays(saved.parts['slam'])

@@ -20,7 +20,7 @@ from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.contracts import KeyframePath
 from segfloor_ros.core.errors import MapError
 from segfloor_ros.core.geometry import Array, invert
-from segfloor_ros.core.pipeline import make_slam
+from segfloor_ros.core.plugins.assembly import make_slam
 from segfloor_ros.core.timing import StageTimes
 from tools.driving import after_sensors, drive, noisy, open_recording
 

@@ -34,11 +34,12 @@ from segfloor_ros.apps.simulation.simulation import render_once
 from segfloor_ros.apps.trajectory import corrected_trajectory, read_trajectory
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import FrameResult, StereoFrame
-from segfloor_ros.core.files.results import MapFile, read_map_file, write_map_file
+from segfloor_ros.core.files.arrays import MapFile
+from segfloor_ros.core.files.results import read_map_file, write_map_file
 from segfloor_ros.core.geometry import Array, invert, transform_points
-from segfloor_ros.core.pipeline import make_slam
-from segfloor_ros.core.plugins.saved_slam import PART, gap_ns, load_slam, mount_of, save_slam
-from segfloor_ros.core.slam.places.loop_closing import OFFSET, as_seen_by, merge_slam
+from segfloor_ros.core.plugins.assembly import make_slam
+from segfloor_ros.core.plugins.maps.known_map import OFFSET, as_seen_by, merge_slam
+from segfloor_ros.core.plugins.maps.saved_slam import PART, gap_ns, load_slam, mount_of, save_slam
 from segfloor_ros.core.slam.rig import Rig
 from segfloor_ros.nodes.configuration import resolve
 from tools.buildings import KINDS, make_building

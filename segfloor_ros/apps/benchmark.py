@@ -47,7 +47,8 @@ from segfloor_ros.core.contracts import (
 from segfloor_ros.core.errors import SegfloorError, SettingsError
 from segfloor_ros.core.geometry import Array, invert, make_transform, transform_points
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.core.pipeline import KeyframeStages, MapInput, make_slam
+from segfloor_ros.core.pipeline import MapInput
+from segfloor_ros.core.plugins.assembly import make_slam, make_stages
 from segfloor_ros.core.processes import how_it_ended, start_apart
 from segfloor_ros.core.timing import Profile, StageTimes, spread_of
 
@@ -423,7 +424,7 @@ class MeasuredStages:
         self.tracked = 0
         self.points = 0
         self._slam = make_slam(camera, configuration.stereo_slam, mount, self.times)
-        self._stages = KeyframeStages(camera, configuration, self.times)
+        self._stages = make_stages(camera, configuration, self.times)
         self._reference = ReferenceWorkload()
         self._reference.time()
         self._memory = MemoryLog()

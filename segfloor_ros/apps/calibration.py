@@ -19,13 +19,13 @@ from segfloor_ros.apps.recordings.image_folders import find_image_pairs
 from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.contracts import StereoFrame
+from segfloor_ros.core.contracts import InputFault, StereoFrame
 from segfloor_ros.core.errors import CalibrationError, InputError
 from segfloor_ros.core.files.images import CorruptImageError, Grey, read_grey
 from segfloor_ros.core.files.writing import PAGE as HTML
 from segfloor_ros.core.files.writing import YAML, check_output, write_output
 from segfloor_ros.core.geometry import Array, make_transform
-from segfloor_ros.core.plugins.rig.check import EVERY, InputFault, RigCheck
+from segfloor_ros.core.plugins.rig.check import EVERY, RigCheck
 from segfloor_ros.core.plugins.rig.estimates import ROWS_PX
 
 MIN_PAIRS = 5

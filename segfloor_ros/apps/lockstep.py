@@ -34,16 +34,28 @@ from segfloor_ros.core.contracts import (
     StereoFrame,
 )
 from segfloor_ros.core.errors import MapError, SegfloorError, SettingsError
-from segfloor_ros.core.files.results import SAVED_MAP, MapFile, read_map_file, write_map_file
+from segfloor_ros.core.files.arrays import MapFile
+from segfloor_ros.core.files.results import SAVED_MAP, read_map_file, write_map_file
 from segfloor_ros.core.files.writing import check_output
 from segfloor_ros.core.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
-from segfloor_ros.core.pipeline import CAMERA_AS_BASE, Pipeline
+from segfloor_ros.core.grid.occupancy import OccupancyGrid
+from segfloor_ros.core.pipeline import KeyframeStages, Pipeline
+from segfloor_ros.core.plugins.assembly import make_pipeline
+from segfloor_ros.core.plugins.maps.saved_slam import (
+    check_camera,
+    load_pipeline,
+    new_keyframes,
+    save_pipeline,
+)
 from segfloor_ros.core.plugins.rig.check import SETTLED_FRAMES
-from segfloor_ros.core.plugins.saved_slam import check_camera, new_keyframes
-from segfloor_ros.core.plugins.semantics.network import Network
+from segfloor_ros.core.plugins.semantics.label_map import Labels
+from segfloor_ros.core.plugins.semantics.network import ImageLabeller, Network
+from segfloor_ros.core.plugins.semantics.semantic_map import SemanticMap
 from segfloor_ros.core.slam.held_results import left_out
+from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE
 from segfloor_ros.core.slam.thresholds import MAJORITY
+from segfloor_ros.core.timing import StageTimes
 
 logger = logging.getLogger(__name__)
 
@@ -173,8 +185,10 @@ class LockstepRun:
         self._save_masks = save_masks
         self._save_debug = save_debug
         self._memory = MemoryLog()
-        self._pipeline = Pipeline(
-            source.camera, configuration, self._on_keyframe, path_only, network
+        times = StageTimes()
+        self._labeller = None if network is None else ImageLabeller(network, times)
+        self._pipeline = make_pipeline(
+            source.camera, configuration, self._on_keyframe, path_only, self._labeller, times
         )
         # Other frames are masked by a segmentation of their own, of which the map does not hear.
         self._other_frames = FloorSegmentation(source.camera, configuration.floor_segmentation)
@@ -184,7 +198,7 @@ class LockstepRun:
         self._map_options = map_options
         loaded = map_options.read(source.camera)
         if loaded is not None:
-            self._pipeline.load(loaded, str(map_options.load), map_options.localize)
+            load_pipeline(self._pipeline, loaded, str(map_options.load), map_options.localize)
         self._unmasked: dict[int, StereoFrame] = {}
         self._results: list[FrameResult] = []
         self._failed_frames = 0
@@ -227,7 +241,7 @@ class LockstepRun:
             mount,
             self._summary(wall_s, grid is not None),
             self._configuration,
-            stages.labels(grid),
+            _labels(stages, grid),
         )
 
     def _leave_out_unmapped(self) -> None:
@@ -256,7 +270,7 @@ class LockstepRun:
             self.note = f'{save}: is not written, since there is no map'
             return
         inputs = (self._map_options.load, *self._map_options.inputs)
-        write = partial(write_map_file, saved=self._pipeline.save(), inputs=inputs)
+        write = partial(write_map_file, saved=save_pipeline(self._pipeline), inputs=inputs)
         self.note = self._map_options.write(write, self._is_cut_short)
 
     def _tracked_poses(self) -> list[TrackedPose]:
@@ -303,7 +317,7 @@ class LockstepRun:
 
     def _masked_frames(self) -> Iterator[StereoFrame]:
         """Yield the frames; where there is a network, it looks at them on a thread of its own."""
-        labeller = self._pipeline.labeller
+        labeller = self._labeller
         self._source.takes_colour = labeller is not None and labeller.sees_colours
         frames = self._source.frames()
         return frames if labeller is None else prefetched(labeller.with_masks(frames))
@@ -349,7 +363,7 @@ class LockstepRun:
         if result.keyframe is not None or self._known_mount is None:
             return
         T_map_base = result.T_map_odom @ result.T_odom_base if result.tracked else None
-        labeller = self._pipeline.labeller
+        labeller = self._labeller
         said = None if labeller is None else labeller.says(frame.stamp_ns, frame.left)
         floor = self._other_frames.process(
             frame.left, frame.right, self._known_mount, T_map_base, said=said
@@ -424,3 +438,11 @@ def lost_frame(frame: StereoFrame) -> FrameResult:
     return FrameResult(
         frame.index, frame.stamp_ns, False, nowhere, nowhere, unknown, 0, 'lost: failed', 0
     )
+
+
+def _labels(stages: KeyframeStages, grid: OccupancyGrid | None) -> Labels | None:
+    """Return the labels of the map, None where no network has looked at it."""
+    semantics = stages.semantics
+    if not isinstance(semantics, SemanticMap) or stages.labelled is None:
+        return None
+    return semantics.labels(grid, stages.path, stages.labelled.point_id)

@@ -8,17 +8,18 @@ gets. Stages import these and their own room, never one another.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.core.files.arrays import Arrays
 from segfloor_ros.core.geometry import (
     R_ROS_OPTICAL,
     Array,
-    adjoint,
     angles_of_rotation,
     make_transform,
     rotation_from_angles,
@@ -361,11 +362,171 @@ class RelativeMotion:
         """Return the motion of no time at all."""
         return cls(np.eye(4), np.zeros((6, 6)))
 
-    def then(self, later: RelativeMotion) -> RelativeMotion:
-        """Return the motion over both stretches (Barfoot 2017, section 7.3.3, to second order)."""
-        A = adjoint(later.T_now_before)
-        return RelativeMotion(
-            later.T_now_before @ self.T_now_before,
-            A @ self.covariance @ A.T + later.covariance,
-            later.source if self.by_wheels else self.source,
-        )
+
+@dataclass(frozen=True)
+class LoadedMap:
+    """What SLAM has loaded, for the stages behind it: all keyframes, all points, and by how much
+    the stamps of the keyframes are later than in the file.
+    """
+
+    path: KeyframePath
+    cloud: SparseCloud
+    shift_ns: int
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What a search for moving things found. disparity: (h, w) px of the shrunk image, 0 where none
+    was found. moving: what moves in it, (h, w), 255. region: the same in the image, None for
+    nothing. points: of what moves, in the world.
+    """
+
+    disparity: NDArray[np.float32]
+    moving: NDArray[np.uint8]
+    region: NDArray[np.uint8] | None
+    points: MovingPoints
+
+
+@dataclass(frozen=True)
+class InputFault:
+    """What is wrong with the images: `fault` in a word, a figure with its unit, what was found in
+    words that go on after the name of the images, and what to do.
+    """
+
+    fault: str
+    value: float
+    unit: str
+    finding: str
+    remedy: str
+    images: str = 'left and right images'
+
+    def line(self, images: str = '') -> str:
+        """Return the fault in one line. images: their name, if they have one of their own."""
+        return f'{images or self.images} {self.finding}; {self.remedy}'
+
+
+class Placed(Protocol):
+    """A keyframe of the sparse map, whose pose T_camera_world (4, 4) is adjusted later."""
+
+    T_camera_world: Array
+
+
+class RigCheck(Protocol):
+    """Finds what is wrong with the images of a rig, and corrects what it can. faults: by name."""
+
+    faults: dict[str, InputFault]
+
+    def watch(self, frame: StereoFrame, turn_rad: float) -> None:
+        """Take in a frame. turn_rad: by how much the camera turned since the one before."""
+
+    def corrected(self, frame: StereoFrame) -> StereoFrame:
+        """Return a frame with its right image corrected by what was found."""
+
+    def as_dicts(self) -> list[dict[str, Any]]:
+        """Return fault, value, unit and remedy of all that was found."""
+
+
+class MovingObjects(Protocol):
+    """Finds what moves in keyframes, and in some of the frames between."""
+
+    def is_due(self, stamp_ns: int, is_keyframe: bool, is_tracked: bool) -> bool:
+        """Whether to search a frame."""
+
+    def search(
+        self, frame: StereoFrame, T_camera_world: Array, T_odom_camera: Array, mount: Mount | None
+    ) -> Searched:
+        """Find what moves in a frame whose pose is known."""
+
+    def remember(self, keyframe: Placed, disparity: NDArray[np.float32]) -> None:
+        """Take in what a keyframe saw."""
+
+    def seen_through(self, disparity: NDArray[np.float32], points: Array) -> NDArray[np.bool_]:
+        """Return at which points (N, 3) of the left optical frame nothing is any more."""
+
+    def reset(self) -> None:
+        """Forget all frames: where the next ones are relative to them is not known."""
+
+
+class BodySensors(Protocol):
+    """Measures the motion of the camera by wheels and IMU, and learns their errors from the images.
+
+    T_base_left: (4, 4), the mount, None until it is known. messages: used, by sensor. remarks:
+    what seems wrong, in words.
+    """
+
+    T_base_left: Array | None
+    messages: dict[str, int]
+    remarks: dict[str, str]
+
+    @property
+    def lag_ns(self) -> int:
+        """How much later than those of the images the stamps of the sensors are."""
+
+    @property
+    def latest_wheels(self) -> list[WheelPose]:
+        """The last poses that the wheels measured."""
+
+    @property
+    def up_world(self) -> Up | None:
+        """Up in the world, as an accelerometer has it."""
+
+    def up_camera(self, T_odom_camera: Array) -> Up | None:
+        """Return up in the camera's axes as the latest measurement has it."""
+
+    def add(self, measurement: Measurement) -> None:
+        """Take in what a sensor measured."""
+
+    def remark(self, remarks: Mapping[str, str]) -> None:
+        """Note what seems wrong."""
+
+    def turn(self, before_ns: int, now_ns: int) -> tuple[Array, float] | None:
+        """Return R_now_before (3, 3) by the gyroscope, and the sigma of its angles in radians."""
+
+    def between(self, before_ns: int, now_ns: int) -> RelativeMotion | None:
+        """Return the motion between two times by wheels."""
+
+    def by_inertia(
+        self, before_ns: int, now_ns: int, T_odom_before: Array, R_world_odom: Array
+    ) -> RelativeMotion | None:
+        """Return the motion since the last pose by an IMU alone."""
+
+    def learn(self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array) -> None:
+        """Learn from the pose of a frame that the images show well."""
+
+    def carry(
+        self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array, on_wheels: bool
+    ) -> None:
+        """Note the pose of a frame that the sensors alone measured."""
+
+    def reset(self) -> None:
+        """Begin anew after a frame without a pose."""
+
+    def reset_world(self) -> None:
+        """Forget where up is: the world is another one."""
+
+
+class Semantics(Protocol):
+    """Labels what keyframes show by a segmentation network, and the map by them."""
+
+    @property
+    def remarks(self) -> list[str]:
+        """What seems wrong, in words."""
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the network looks at keyframes alone, once they are keyframes."""
+
+    def moving(self, frame: StereoFrame) -> NDArray[np.uint8]:
+        """Return the mask (H, W) of what may move in a frame, 255."""
+
+    def says(self, keyframe: Keyframe) -> NDArray[np.uint8] | None:
+        """Return what the network says of the floor in a keyframe, (H, W) as a floor mask."""
+
+    def add(self, keyframe: Keyframe, floor: FloorObservation, mount: Mount) -> None:
+        """Take in a keyframe whose floor is segmented."""
+
+    def to_parts(self) -> dict[str, Arrays]:
+        """Return what keyframes showed, as parts of a saved map."""
+
+    def from_parts(self, parts: dict[str, Arrays], shift_ns: int) -> None:
+        """Go on with the parts of a saved map, whose stamps are later by shift_ns."""

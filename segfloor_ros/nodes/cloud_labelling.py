@@ -13,7 +13,7 @@ from rclpy.task import Future
 
 from segfloor_ros.core.cloud import CloudLabelling
 from segfloor_ros.core.contracts import POINT_FLOOR, LabelledPoints, SparseCloud
-from segfloor_ros.core.files.results import MapFile
+from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.settings import RobotSettings
 from segfloor_ros.nodes.configuration import ROBOT_PARAMETERS, CloudLabellingNodeSettings
 from segfloor_ros.nodes.messages import arrays

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from segfloor_ros.core.geometry import HISTORY_NS, MAX_DISORDER_NS, Array, between, invert
+from segfloor_ros.core.geometry import HISTORY_NS, MAX_DISORDER_NS, Array, invert
+from segfloor_ros.core.twists import between
 
 
 class FrameTree:

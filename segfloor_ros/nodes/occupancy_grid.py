@@ -9,7 +9,7 @@ from typing import Any
 from rclpy.timer import Timer
 
 from segfloor_ros.core.errors import MapError, SettingsError
-from segfloor_ros.core.files.results import MapFile
+from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.files.whole import user_path
 from segfloor_ros.core.grid.mapper import OccupancyGridMapper
 from segfloor_ros.nodes.configuration import OccupancyGridNodeSettings

@@ -27,10 +27,9 @@ from segfloor_ros.core.camera.images import (
     eye_calibration,
     grey_image,
 )
-from segfloor_ros.core.contracts import Mount
+from segfloor_ros.core.contracts import InputFault, Mount
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import MAX_DISORDER_NS
-from segfloor_ros.core.plugins.rig.check import InputFault
 from segfloor_ros.nodes.configuration import StereoSlamNodeSettings
 from segfloor_ros.nodes.messages.arrays import same_calibration
 from segfloor_ros.nodes.messages.diagnostics import LASTS_S, RECENT, Level

@@ -21,14 +21,15 @@ from std_msgs.msg import UInt8MultiArray
 
 from segfloor_ros.core.camera.calibration import StereoCalibration
 from segfloor_ros.core.camera.pixels import Region, shrink_factor, shrunk_camera, shrunk_image
-from segfloor_ros.core.contracts import FrameResult, Keyframe, Mount, StereoFrame
+from segfloor_ros.core.contracts import FrameResult, Keyframe, LoadedMap, Mount, StereoFrame
 from segfloor_ros.core.errors import MapError, SegfloorError, SettingsError
-from segfloor_ros.core.files.results import SAVED_MAP, MapFile, read_map_file, write_map_file
+from segfloor_ros.core.files.arrays import MapFile
+from segfloor_ros.core.files.results import SAVED_MAP, read_map_file, write_map_file
 from segfloor_ros.core.files.whole import user_path
 from segfloor_ros.core.files.writing import check_output
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.pipeline import prune_file
-from segfloor_ros.core.plugins.saved_slam import LoadedMap, save_slam
+from segfloor_ros.core.plugins.maps.pruning import prune_file
+from segfloor_ros.core.plugins.maps.saved_slam import save_slam
 from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.nodes.configuration import StereoSlamNodeSettings

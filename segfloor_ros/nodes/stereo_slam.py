@@ -6,15 +6,15 @@ import time
 
 from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.files.results import MapFile
-from segfloor_ros.core.pipeline import CAMERA_AS_BASE, make_slam
-from segfloor_ros.core.plugins.saved_slam import (
+from segfloor_ros.core.files.arrays import MapFile
+from segfloor_ros.core.plugins.assembly import make_slam
+from segfloor_ros.core.plugins.maps.saved_slam import (
     last_pose_of,
     last_pose_values,
     load_slam,
     saved_camera,
 )
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
+from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE, StereoSlam
 from segfloor_ros.nodes.configuration import StereoSlamNodeSettings
 from segfloor_ros.nodes.messages.diagnostics import Level
 from segfloor_ros.nodes.messages.topics import FRAME_DONE, make_header

@@ -30,7 +30,7 @@ from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.errors import MapError, SegfloorError, SettingsError
 from segfloor_ros.core.geometry import invert, transform_points
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED
-from segfloor_ros.core.pipeline import Pipeline
+from segfloor_ros.core.plugins.assembly import make_pipeline
 from segfloor_ros.nodes.configuration import resolve
 
 CONFIGURATION = resolve()
@@ -130,7 +130,7 @@ def test_the_floor_in_the_images_has_the_disparity_of_the_floor():
 def test_the_chain_makes_the_map_of_the_pipeline():
     chain = MeasuredStages(CAMERA, CONFIGURATION, MOUNT)
     settings = {'camera_height_m': 0.3, 'camera_pitch_rad': 0.12, 'camera_roll_rad': 0.0}
-    pipeline = Pipeline(CAMERA, resolve(stereo_slam=settings))
+    pipeline = make_pipeline(CAMERA, resolve(stereo_slam=settings))
     for frame in CorridorImages(CHAIN_FRAMES, seed=0).drive():
         chain.process(frame)
         pipeline.process(frame)

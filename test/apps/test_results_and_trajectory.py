@@ -12,8 +12,9 @@ from segfloor_ros.apps.results_folder import (
 from segfloor_ros.apps.trajectory import TrackedPose, Trajectory, corrected_trajectory, write_tum
 from segfloor_ros.core.contracts import KeyframePath, Mount
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.geometry import invert, se3_exp
+from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.timing import StageTimes
+from segfloor_ros.core.twists import se3_exp
 
 
 def moved(x, yaw=0.0):

@@ -14,13 +14,10 @@ from segfloor_ros.core.geometry import (
     make_transform,
     rotation_angle,
     rotation_from_angles,
-    rotation_vectors,
-    rotations_by,
-    se3_exp,
-    se3_log,
     transform_points,
 )
 from segfloor_ros.core.quaternions import quaternion_xyzw, transform_from_quaternion
+from segfloor_ros.core.twists import rotation_vectors, rotations_by, se3_exp, se3_log
 
 
 @pytest.mark.parametrize('scale', [1e-9, 1e-3, 0.5, 2.5])

@@ -15,7 +15,7 @@ from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.apps.stereo_camera import make_stereo_camera
 from segfloor_ros.core.contracts import Mount, StereoFrame
-from segfloor_ros.core.pipeline import Pipeline
+from segfloor_ros.core.plugins.assembly import make_pipeline
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.configuration import resolve
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
@@ -147,7 +147,7 @@ def test_a_mount_that_turns_out_to_be_wrong_has_all_nodes_map_anew(make_graph) -
     names = ('camera_mount', MAP_START, 'map')
     mounts, starts, maps = (chain.graph.collect(name) for name in names)
     chain.send(frames)
-    pipeline = Pipeline(CAMERA, resolve(assignments=['stereo_slam.keyframe_max_frames=1']))
+    pipeline = make_pipeline(CAMERA, resolve(assignments=['stereo_slam.keyframe_max_frames=1']))
     results = [result for frame in frames for result in pipeline.process(frame)]
     assert len(results) > len(frames)
     last_ns = max(result.stamp_ns for result in results if result.keyframe is not None)

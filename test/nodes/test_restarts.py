@@ -15,7 +15,7 @@ from ros_graph import fresh_graph, surroundings
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.core.contracts import POINT_UNKNOWN, LabelledPoints, StereoFrame
-from segfloor_ros.core.files.results import MapFile
+from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.slam.places.views import NEW_TURN_RAD

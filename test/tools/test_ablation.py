@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from segfloor_ros.core.camera.recording import RecordedSensor
 from segfloor_ros.core.contracts import StereoFrame, WheelPose
 from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.settings import StereoSlamSettings
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.nodes.configuration import resolve
 from tools.ablation import app
 from tools.driving import after_sensors, noisy
@@ -44,7 +44,7 @@ def test_noise_follows_its_seed() -> None:
 def test_slam_has_what_sensors_measured_up_to_a_frame_before_it():
     told = [WheelPose(k * 40_000_000, np.eye(4)) for k in range(20)]
     sensors = [RecordedSensor('wheel_odometry', 'here', len(told), True, lambda: told)]
-    slam = StereoSlam(CAMERA, StereoSlamSettings(), MOUNT)
+    slam = equipped_slam(CAMERA, StereoSlamSettings(), MOUNT)
     frames, _ = room_drive(3)
     had = [
         (frame.index, slam.sensors.messages['wheel_odometry'])

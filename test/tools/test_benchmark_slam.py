@@ -19,7 +19,7 @@ from segfloor_ros.apps.trajectory import read_trajectory
 from segfloor_ros.core.camera.recording import StereoCameraSettings
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import invert
-from segfloor_ros.core.pipeline import Pipeline
+from segfloor_ros.core.plugins.assembly import make_pipeline
 from segfloor_ros.nodes.configuration import resolve
 from tools.benchmark_slam import benchmark_slam, drives_table, soak_table
 from tools.endless_drive import write_endless_drive
@@ -94,7 +94,7 @@ def test_a_soak_goes_to_and_fro_and_its_map_does_not_grow(drive, tmp_path) -> No
     path = write_endless_drive(source, tmp_path / 'drive', duration_s=48.0, rate_hz=2.0)
     endless = open_source(StereoCameraSettings(input=str(path)))
     _, truth = read_trajectory(drive / 'poses.txt')
-    pipeline = Pipeline(endless.camera, resolve())
+    pipeline = make_pipeline(endless.camera, resolve())
     parts = Soak(pipeline, endless, truth).run(lambda done: None)
     assert [part.frames for part in parts] == list(range(12, 97, 12))
     assert parts[-1].tracked == 96

@@ -20,14 +20,9 @@ from segfloor_ros.apps.evaluation.maps import resample
 from segfloor_ros.apps.label_files import draw_labels, filter_mask, save_labels
 from segfloor_ros.core.contracts import KeyframePath, SparseCloud
 from segfloor_ros.core.errors import InputError, MapError, SettingsError
+from segfloor_ros.core.files.arrays import Arrays, MapFile
 from segfloor_ros.core.files.images import png_bytes
-from segfloor_ros.core.files.results import (
-    SAVED_MAP,
-    Arrays,
-    MapFile,
-    read_map_file,
-    write_map_file,
-)
+from segfloor_ros.core.files.results import SAVED_MAP, read_map_file, write_map_file
 from segfloor_ros.core.files.writing import PNG, check_output, marked_png, write_output
 from segfloor_ros.core.floor.pictures import MASK_COLOURS
 from segfloor_ros.core.geometry import planar
@@ -41,8 +36,9 @@ from segfloor_ros.core.grid.occupancy import (
     OccupancyGridSettings,
     enlarged,
 )
-from segfloor_ros.core.pipeline import prune_file
-from segfloor_ros.core.plugins.saved_slam import (
+from segfloor_ros.core.plugins.maps.known_map import OFFSET, as_seen_by, merge_slam
+from segfloor_ros.core.plugins.maps.pruning import prune_file
+from segfloor_ros.core.plugins.maps.saved_slam import (
     PART,
     gap_ns,
     loaded_map,
@@ -53,7 +49,6 @@ from segfloor_ros.core.plugins.saved_slam import (
     straightened,
 )
 from segfloor_ros.core.plugins.semantics.label_map import LABELS, LabelMap, Labels
-from segfloor_ros.core.slam.places.loop_closing import OFFSET, as_seen_by, merge_slam
 from segfloor_ros.core.slam.places.loops import MAX_SLOPE, MAX_STEP_UP_M
 from segfloor_ros.core.slam.rig import Rig
 from segfloor_ros.nodes.map_files import check_map_output, save_map

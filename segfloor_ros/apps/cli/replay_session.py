@@ -39,9 +39,9 @@ from segfloor_ros.core.cloud import CloudLabelling
 from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.contracts import KeyframePath, LabelledPoints
 from segfloor_ros.core.errors import InputError, MapError, SegfloorError
-from segfloor_ros.core.files.results import MapFile
+from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.core.plugins.saved_slam import loaded_map, new_keyframes
+from segfloor_ros.core.plugins.maps.saved_slam import loaded_map, new_keyframes
 from segfloor_ros.core.processes import Interrupt, rss_mb
 from segfloor_ros.nodes.map_files import load_map
 from segfloor_ros.nodes.messages.arrays import grid_of, labelled_arrays, sparse_cloud_arrays

@@ -203,7 +203,7 @@ class View:
     def _keyframe(self, keyframe: Keyframe, floor: FloorObservation, pipeline: Pipeline) -> None:
         stamp_ns, stages = keyframe.stamp_ns, pipeline.keyframe_stages
         assert pipeline.mount is not None
-        camera = pipeline.camera
+        camera = pipeline.slam.rig.camera
         self.camera(camera.K, (camera.width, camera.height), pipeline.mount.T_base_left)
         self.overlay(stamp_ns, mask_overlay(keyframe.left, floor.mask, keyframe.moving))
         self.path(stamp_ns, keyframe.path)

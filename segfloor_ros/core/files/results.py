@@ -8,8 +8,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Iterable, Mapping, Sized
-from dataclasses import dataclass, field
+from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.errors import InputError, os_errors
+from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.files.whole import check_file, json_object
 from segfloor_ros.core.files.writing import Kind, output_file
 
@@ -27,18 +27,6 @@ COMPRESSION_LEVEL = 3
 
 MAX_RATIO, SMALL = 20, 1 << 24
 """A map unpacks to at most so many times its size, and a small one to so many bytes more."""
-
-Arrays = dict[str, NDArray[Any]]
-
-
-@dataclass
-class MapFile:
-    """The parts of a map by the name of the stage that they belong to, and a header of plain values
-    (numbers, texts, lists, dictionaries).
-    """
-
-    header: dict[str, Any]
-    parts: dict[str, Arrays] = field(default_factory=dict)
 
 
 def write_map_file(path: Path, saved: MapFile, inputs: Iterable[Path | str | None] = ()) -> None:
@@ -152,32 +140,3 @@ def _add(archive: zipfile.ZipFile, name: str, content: bytes | memoryview) -> No
     member = zipfile.ZipInfo(name)  # without the time of day
     member.compress_type = archive.compression
     archive.writestr(member, content)
-
-
-def joined(arrays: list[NDArray[Any]], empty: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return arrays (N_i, ...) as one (sum N_i, ...) and their lengths; empty: one of no rows."""
-    lengths = np.array([len(array) for array in arrays], np.int64)
-    return np.concatenate([empty, *arrays]), lengths
-
-
-def split(array: NDArray[Any], lengths: NDArray[Any]) -> list[NDArray[Any]]:
-    """Return the arrays that `joined` made one of. Raises ValueError where lengths do not fit."""
-    if lengths.sum() != len(array):
-        raise ValueError(f'{len(array)} rows, but {lengths.sum()} are expected')
-    return np.split(array, np.cumsum(lengths)[:-1].tolist()) if len(lengths) else []
-
-
-def take(arrays: Arrays, kept: NDArray[np.bool_], lengths: Mapping[str, str]) -> Arrays:
-    """Return the rows of columns (K, ...) that are kept (K,). lengths: of columns that `joined`
-    made by row, the names of those with their lengths; they need not be there. Raises IndexError or
-    ValueError where they do not fit.
-    """
-    there = {name: count for name, count in lengths.items() if name in arrays}
-    of_rows = {name: np.repeat(kept, arrays[count]) for name, count in there.items()}
-    return {name: array[of_rows.get(name, kept)] for name, array in arrays.items()}
-
-
-def check_lengths(arrays: Mapping[str, Sized]) -> None:
-    """Raise ValueError unless all arrays have the same length."""
-    if len({len(array) for array in arrays.values()}) > 1:
-        raise ValueError('columns of different lengths')

@@ -25,7 +25,7 @@ from segfloor_ros.core.contracts import (
     KeyframeFeatures,
     LabelledPoints,
 )
-from segfloor_ros.core.files.results import Arrays, joined, split
+from segfloor_ros.core.files.arrays import Arrays, joined, split
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.grid.occupancy import OccupancyGridSettings
 

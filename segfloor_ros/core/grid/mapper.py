@@ -24,7 +24,7 @@ from segfloor_ros.core.contracts import (
     LabelledPoints,
 )
 from segfloor_ros.core.errors import MapError
-from segfloor_ros.core.files.results import Arrays, check_lengths
+from segfloor_ros.core.files.arrays import Arrays, check_lengths
 from segfloor_ros.core.geometry import Array, Pose2d, planar
 from segfloor_ros.core.grid.keyframe_evidence import (
     SUBPIXEL_BITS,

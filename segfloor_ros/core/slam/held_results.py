@@ -19,8 +19,9 @@ from segfloor_ros.core.contracts import (
     Mount,
     MovingPoints,
 )
-from segfloor_ros.core.geometry import Array, adjoint, invert, transform_points
+from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.tracking.track import Track
+from segfloor_ros.core.twists import adjoint
 
 NOT_RECOGNISED = 'mapped, but no place of the map was recognised'
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.contracts import NO_POINT, RelativeMotion, Up
-from segfloor_ros.core.files.results import Arrays, check_lengths
+from segfloor_ros.core.files.arrays import Arrays, check_lengths
 from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.slam.rig import Observations, Rig
 from segfloor_ros.core.slam.thresholds import PROOF

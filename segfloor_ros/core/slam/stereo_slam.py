@@ -1,17 +1,12 @@
-"""Stereo SLAM: from stereo frames to poses, keyframes and a sparse map.
-
-What SLAM asks of whoever measures the camera's mount.
-"""
+"""Stereo SLAM: from stereo frames to poses, keyframes and a sparse map."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.camera.pixels import BlankBorder, Region
@@ -23,17 +18,14 @@ from segfloor_ros.core.contracts import (
     LastPose,
     Measurement,
     Mount,
+    Searched,
     StereoFrame,
-    Up,
 )
-from segfloor_ros.core.files.results import Arrays
-from segfloor_ros.core.geometry import Array, adjoint, invert, rotation_angle, transform_points
-from segfloor_ros.core.plugins.moving.moving_regions import MovingRegions, Searched
-from segfloor_ros.core.plugins.rig.check import RigCheck
-from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
-from segfloor_ros.core.plugins.sensors.gyroscope import STEP_NS
+from segfloor_ros.core.files.arrays import Arrays
+from segfloor_ros.core.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.core.slam.held_results import HeldResults, in_map, left_out
 from segfloor_ros.core.slam.mapping.back_end import BackEnd, Submap
+from segfloor_ros.core.slam.optional import MountMeter, Plugins
 from segfloor_ros.core.slam.places.views import GroundViews
 from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, Rig
 from segfloor_ros.core.slam.settings import StereoSlamSettings
@@ -45,6 +37,10 @@ from segfloor_ros.core.slam.tracking.motion import CameraMotion, TrackingState
 from segfloor_ros.core.slam.tracking.patch_alignment import sample_patches
 from segfloor_ros.core.slam.tracking.track import Track
 from segfloor_ros.core.timing import StageTimes
+from segfloor_ros.core.twists import adjoint
+
+LOOK_NS = 500_000_000
+"""The floor is looked at again after so long, for the mount of a camera that is not known yet."""
 
 LOST_NS = 1_500_000_000
 """For so long every frame is looked for in the map; after that the camera maps on its own. Beside a
@@ -102,12 +98,13 @@ class StereoSlam:
     known, since frame `map` lies on the floor; then all of them come at once, none is lost. Until
     then `provisional` is the newest pose. Where `mount` changes later, all of them come once more,
     from the first one on.
-    background: adjust the map on a thread beside tracking; a keyframe is then published before its
-    adjustment, and results depend on timing. rig, map, sensors: what is known of each. rig_check:
-    what is wrong with the images. sessions: the drives that made the map it goes on with.
-    front_end, back_end: tracking and mapping. late_masks: of keyframes, when they come. announce:
-    where given, is called with the outcome of a frame that becomes a keyframe, in ROS frames, the
-    frame and what moves in it, before the map has taken it in; only where results depend on timing.
+    plugins: what it can do without. background: adjust the map on a thread beside tracking; a
+    keyframe is then published before its adjustment, and results depend on timing. rig, map,
+    sensors: what is known of each. rig_check: what is wrong with the images. sessions: the
+    drives that made the map it goes on with. front_end, back_end: tracking and mapping.
+    late_masks: of keyframes, when they come. announce: where given, is called with the outcome
+    of a frame that becomes a keyframe, in ROS frames, the frame and what moves in it, before
+    the map has taken it in; only where results depend on timing.
     """
 
     def __init__(
@@ -118,7 +115,9 @@ class StereoSlam:
         mount_meter: MountMeter | None = None,
         times: StageTimes | None = None,
         background: bool = False,
+        plugins: Plugins | None = None,
     ) -> None:
+        plugins = plugins or Plugins()
         self.rig = Rig(camera, mount)
         self.map = SparseMap(self.rig)
         self.sessions: list[dict[str, int]] = []
@@ -126,14 +125,13 @@ class StereoSlam:
         self._camera = camera
         self._settings = settings
         self._times = times or StageTimes()
-        self.sensors = BodyMotion()
-        self.rig_check = RigCheck(camera)
+        self.sensors, self.rig_check = plugins.sensors, plugins.rig_check
         self.front_end = FrontEnd(settings, self.map, self.sensors)
-        self.back_end = BackEnd(settings, self.map, self.front_end, background)
+        self.back_end = BackEnd(settings, self.map, self.front_end, background, plugins.keeper)
         self._ground = GroundViews(self.rig)
         self._border = BlankBorder()
         self._held = HeldResults()
-        self._moving = MovingRegions(camera) if settings.detect_moving else None
+        self._moving = plugins.moving
         self._lost_ns: int | None = None
         self._looked_ns = 0
         self._shows_nothing = False
@@ -216,9 +214,7 @@ class StereoSlam:
                 self._search_on(frame, images, fault)
         is_wanted = not fault and self.back_end.wants_keyframe(track, frame.stamp_ns)
         searched = None
-        if self._moving is not None and self._moving.is_due(
-            frame.stamp_ns, is_wanted, track is not None
-        ):
+        if self._moving.is_due(frame.stamp_ns, is_wanted, track is not None):
             with self._times.measure('moving'):
                 searched = self._moving.search(
                     frame,
@@ -343,7 +339,11 @@ class StereoSlam:
             found, _ = self.back_end.find_in_known(images, features, frame.stamp_ns)
             if is_long or found is not None:
                 self._drop_submap()
-        elif is_long and not (front_end.is_fixed or self.back_end.submap.is_beside):
+        elif (
+            self.back_end.keeper.can_hold
+            and is_long
+            and not (front_end.is_fixed or self.back_end.submap.is_beside)
+        ):
             self._start_submap()
 
     def _start_submap(self) -> None:
@@ -370,7 +370,7 @@ class StereoSlam:
             self.front_end.motion.reset()
             self.sensors.reset_world()
         self.front_end.reset()
-        self._moving = self._moving and MovingRegions(self._camera)
+        self._moving.reset()
 
     def _drop_submap(self) -> None:
         """Look for the camera in the known map again; what was mapped beside it is lost."""
@@ -383,7 +383,7 @@ class StereoSlam:
             self.sensors.reset_world()
         if self._mount_meter is not None:
             self._mount_meter.reset()
-        self._moving = self._moving and MovingRegions(self._camera)
+        self._moving.reset()
         self._held.change(_looked_for if was_looked_for else left_out)
 
     def _add_keyframe(
@@ -420,22 +420,22 @@ class StereoSlam:
             observed.observations,
             self.map.living(observed.point_id),
             motion.since_keyframe.start(motion.T_camera_world, motion.covariance),
-            self.sensors.gravity.up_camera(self.front_end.motion.T_odom_camera),
+            self.sensors.up_camera(self.front_end.motion.T_odom_camera),
             ground=self._ground.take(frame.left),
         )
         patches = sample_patches(images.left, keyframe.observations.uvd_px[:, :2]).astype(np.uint8)
         self.back_end.mapper.insert(keyframe, patches)
-        if self._moving is not None and searched is not None:
+        if searched is not None:
             self._moving.remember(keyframe, searched.disparity)
             ids = np.setdiff1d(self.front_end.local.point_ids, keyframe.point_id)
             points = transform_points(keyframe.T_camera_world, self.map.xyz_world[ids])
             gone = ids[self._moving.seen_through(searched.disparity, points)]
             self.map.points.note_seen_through(gone)
-        up = self.sensors.gravity.up_world
+        up = self.sensors.up_world
         self._follow_map(partial(self.back_end.take_in, keyframe, images, up))
         if self.map.keyframes[-1] is not keyframe:  # it was merged into the known map
             keyframe = self.map.keyframes[-1]
-            self._moving = self._moving and MovingRegions(self._camera)
+            self._moving.reset()
             if self._mount_meter is not None:
                 self._mount_meter.reset()
             self.sensors.reset_world()
@@ -452,12 +452,12 @@ class StereoSlam:
         meter = self._mount_meter
         if meter is None or meter.is_final:
             return
-        is_late = frame.stamp_ns - self._looked_ns >= STEP_NS
+        is_late = frame.stamp_ns - self._looked_ns >= LOOK_NS
         if not is_new_view and (self.mount is not None or not is_late):
             return
         self._looked_ns = frame.stamp_ns
         T_world_camera = invert(self.front_end.motion.T_camera_world)
-        up = self.sensors.gravity.up_world
+        up = self.sensors.up_world
         meter.add(frame.left, frame.right, T_world_camera, up, is_new_view)
         if self.mount is not None and meter.mount != self.mount:
             self._held.take_back()
@@ -548,44 +548,5 @@ def _carried(result: FrameResult, motion: CameraMotion, covariance: Array) -> Fr
     )
 
 
-class MountMeter(Protocol):
-    """Measures the camera's mount from the floor it sees."""
-
-    def add(
-        self,
-        left: NDArray[np.uint8],
-        right: NDArray[np.uint8],
-        T_world_left: Array,
-        up_world: Up | None,
-        is_new_view: bool,
-    ) -> None:
-        """Take in one frame: rectified images (H, W), camera pose (4, 4) in the first one's frame,
-        and where an accelerometer has up in that frame. is_new_view: whether it is a keyframe;
-        others show what the last one does, and take its place.
-        """
-
-    def reset(self) -> None:
-        """Forget all frames: where the next ones are relative to them is not known."""
-
-    @property
-    def mount(self) -> Mount | None:
-        """The mount at the first frame, once it is known; later looks may show another."""
-
-    @property
-    def is_final(self) -> bool:
-        """Whether the mount is known, and looked at often enough."""
-
-    @property
-    def may_change(self) -> bool:
-        """Whether later looks may show another mount."""
-
-    def use(self, mount: Mount) -> None:
-        """Take a mount for given: it is compared with what is seen, and stays as it is."""
-
-    @property
-    def remark(self) -> str | None:
-        """How the mount that was in use differs from the one that the floor shows, in words."""
-
-    @property
-    def provisional(self) -> Mount:
-        """The mount as it seems so far, whatever little is known."""
+CAMERA_AS_BASE = Mount(0.0, 0.0, 0.0)
+"""Where nothing is known of the mount: the camera in the axes of a base."""

@@ -32,3 +32,8 @@ PROOF = 3
 """Keyframes that must show something for it to be believed: that a point stands still, or is gone,
 that a view adds nothing, that a place is seen again; and corners of a thing that moves. By chance
 hardly two agree."""
+
+
+SPEED_SIGMA = 0.5
+"""Error of a speed that nothing measures, m/s: at first, or by wheels that slip; and how much one
+changes that is taken for constant, m/s per root second."""

@@ -37,8 +37,9 @@ from segfloor_ros.core.contracts import (
     SparseCloud,
 )
 from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.files.images import Grey
-from segfloor_ros.core.files.results import FORMAT, MapFile, from_bytes, to_bytes
+from segfloor_ros.core.files.results import FORMAT, from_bytes, to_bytes
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.nodes.messages.scans import free_ranges, near_obstacles
 from segfloor_ros.nodes.messages.topics import make_header, to_ns, to_time

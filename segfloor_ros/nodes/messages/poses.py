@@ -25,8 +25,9 @@ from sensor_msgs.msg import Imu
 from segfloor_ros.core.camera.images import NOT_MEASURED
 from segfloor_ros.core.contracts import ImuSample, KeyframePath, WheelPose
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.geometry import Array, invert, make_transform, quaternions_of, se3_log
+from segfloor_ros.core.geometry import Array, invert, make_transform, quaternions_of
 from segfloor_ros.core.quaternions import rotations_of
+from segfloor_ros.core.twists import se3_log
 from segfloor_ros.nodes.messages.topics import make_header, to_ns
 
 LEAST_VARIANCE = 1e-6

@@ -21,7 +21,8 @@ from sensor_msgs.msg import TimeReference
 from std_msgs.msg import Header, UInt8MultiArray
 
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.files.results import Arrays, MapFile, read_map_file, write_to
+from segfloor_ros.core.files.arrays import Arrays, MapFile
+from segfloor_ros.core.files.results import read_map_file, write_to
 from segfloor_ros.nodes.messages.arrays import (
     is_of_loaded_map,
     map_file_message,

@@ -17,7 +17,7 @@ from rclpy.publisher import Publisher
 from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.core.errors import SegfloorError
-from segfloor_ros.core.files.results import MapFile
+from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.nodes.configuration import NodeSettings
 from segfloor_ros.nodes.messages.diagnostics import HEALTH_PERIOD_S
 from segfloor_ros.nodes.messages.topics import TOPICS, Topic, published_by

@@ -22,8 +22,9 @@ from segfloor_ros.core.files.results import from_bytes, to_bytes, write_map_file
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.grid.keyframe_evidence import evidence_from_arrays, evidence_to_arrays
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED
-from segfloor_ros.core.pipeline import Pipeline, prune
-from segfloor_ros.core.plugins.saved_slam import loaded_map
+from segfloor_ros.core.plugins.assembly import make_pipeline
+from segfloor_ros.core.plugins.maps.pruning import prune
+from segfloor_ros.core.plugins.maps.saved_slam import load_pipeline, loaded_map, save_pipeline
 from segfloor_ros.nodes.configuration import resolve
 
 OTHER_CAMERA = StereoCamera(320, 240, 163.0, 162.0, 157.0, 120.5, 0.125)
@@ -39,12 +40,12 @@ def mapped(poses, seed=0, camera=CAMERA, noise=0, height_m=MOUNT.height_m):
     room.reset_noise(noise)
     mount = {'height_m': height_m, 'pitch_rad': MOUNT.pitch_rad, 'roll_rad': 0.0}
     given = [f'stereo_slam.camera_{name}={value}' for name, value in mount.items()]
-    pipeline = Pipeline(camera, resolve(assignments=given))
+    pipeline = make_pipeline(camera, resolve(assignments=given))
     for k, pose in enumerate(poses):
         pipeline.process(room.frame(k, pose, camera=camera))
     pipeline.finish_tracking()
     pipeline.finish()
-    return SavedMap(f'{seed}.map', from_bytes(to_bytes(pipeline.save()), 'x'))
+    return SavedMap(f'{seed}.map', from_bytes(to_bytes(save_pipeline(pipeline)), 'x'))
 
 
 @pytest.fixture(scope='module')
@@ -119,8 +120,8 @@ def test_points_of_the_second_map_are_as_high_above_their_floor_as_before(first,
 
 @pytest.mark.parametrize('finish', [lambda saved: saved, prune], ids=['merged', 'pruned'])
 def test_a_robot_goes_on_with_a_merged_map(merged, finish):
-    pipeline = Pipeline(CAMERA, resolve(assignments=[]))
-    pipeline.load(from_bytes(to_bytes(finish(merged.file)), 'x'), 'x', localize=True)
+    pipeline = make_pipeline(CAMERA, resolve(assignments=[]))
+    load_pipeline(pipeline, from_bytes(to_bytes(finish(merged.file)), 'x'), 'x', localize=True)
     room, results = StereoRoom(0), []
     for k, pose in enumerate(BESIDE):
         results += pipeline.process(room.frame(k, pose))
@@ -262,9 +263,9 @@ def test_a_damaged_map_is_not_merged(first, second, column, damage):
 @pytest.mark.parametrize('sessions', [3, [{'first_ns': 0}]])
 def test_a_drive_does_not_begin_in_a_map_that_it_could_not_save(first, sessions):
     file = replace(first.file, header=first.file.header | {'sessions': sessions})
-    pipeline = Pipeline(CAMERA, resolve(assignments=[]))
+    pipeline = make_pipeline(CAMERA, resolve(assignments=[]))
     try:
         with pytest.raises(InputError, match=r'x\.map: parts of the map do not fit'):
-            pipeline.load(file, 'x.map', localize=False)
+            load_pipeline(pipeline, file, 'x.map', localize=False)
     finally:
         pipeline.close()

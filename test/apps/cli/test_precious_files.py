@@ -1,5 +1,5 @@
-"""No command replaces, changes or removes a file of the user: every command that writes, onto files of
-every kind, by every form of collision.
+"""No command replaces, changes or removes a file of the user: every command that writes, onto files
+of every kind, by every form of collision.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ PRECIOUS = {
 def made(tmp_path_factory) -> Path:
     """A folder with a recording, a saved map, results, labels and a suite."""
     folder = tmp_path_factory.mktemp('made')
-    frames, _ = room_drive(8)
+    frames, _ = room_drive(20)
     write_kitti(folder / 'drive', frames)
     done = segfloor('run', folder / 'drive', '--out', folder / 'result', '--save-map',
                     folder / 'home.map', *KNOWN_MOUNT)  # fmt: skip

@@ -16,7 +16,7 @@ from segfloor_ros.apps.evaluation.trajectory import (
 )
 from segfloor_ros.apps.trajectory import read_trajectory
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.geometry import se3_exp
+from segfloor_ros.core.twists import se3_exp
 
 
 def drive(count=101, step_m=0.1) -> np.ndarray:

@@ -31,7 +31,7 @@ from segfloor_ros.core.camera.calibration import StereoCalibration
 from segfloor_ros.core.camera.recording import MeasurementLog
 from segfloor_ros.core.contracts import ImuSample, WheelPose
 from segfloor_ros.core.errors import InputError, SettingsError
-from segfloor_ros.core.geometry import se3_exp
+from segfloor_ros.core.twists import se3_exp
 
 WHEELS = '# t x y z qx qy qz qw\n0.00 2 0 0 0 0 0 1\n0.05 2.1 0 0 0 0 0.6 0.8\n0.2 3 0 0 0 0 0 1\n'
 IMU = '#timestamp [ns],w x,w y,w z,a x,a y,a z\n' + ''.join(

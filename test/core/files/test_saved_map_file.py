@@ -10,15 +10,8 @@ import numpy as np
 import pytest
 
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.files.results import (
-    MapFile,
-    from_bytes,
-    joined,
-    read_map_file,
-    split,
-    to_bytes,
-    write_map_file,
-)
+from segfloor_ros.core.files.arrays import MapFile, joined, split
+from segfloor_ros.core.files.results import from_bytes, read_map_file, to_bytes, write_map_file
 
 
 def some_map():

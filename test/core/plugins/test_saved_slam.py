@@ -10,15 +10,18 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import UNKNOWN_COVARIANCE
-from segfloor_ros.core.files.results import MapFile, from_bytes, to_bytes
-from segfloor_ros.core.geometry import invert, se3_exp
-from segfloor_ros.core.plugins.saved_slam import fill_map, load_slam, moved, save_slam
+from segfloor_ros.core.files.arrays import MapFile
+from segfloor_ros.core.files.results import from_bytes, to_bytes
+from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.plugins.assembly import equipped_slam
+from segfloor_ros.core.plugins.maps.known_map import KnownMap, as_seen_by
+from segfloor_ros.core.plugins.maps.map_arrays import fill_map, moved
+from segfloor_ros.core.plugins.maps.saved_slam import load_slam, save_slam
 from segfloor_ros.core.slam.mapping.back_end import Submap
-from segfloor_ros.core.slam.places.loop_closing import KnownMap, as_seen_by
 from segfloor_ros.core.slam.rig import OffsetEstimate, Rig
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import SparseMap
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
+from segfloor_ros.core.twists import se3_exp
 
 SETTINGS = StereoSlamSettings(num_features=600)
 ROOM = StereoRoom()
@@ -45,13 +48,13 @@ def the_same_noise_whatever_ran_before():
 
 @pytest.fixture(scope='module')
 def mapped():
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     drive(slam, there(25))
     return slam
 
 
 def loaded(mapped, localize, **options):
-    slam = StereoSlam(CAMERA, SETTINGS)
+    slam = equipped_slam(CAMERA, SETTINGS)
     load_slam(slam, CAMERA, save_slam(mapped, CAMERA), 'x', localize, **options)
     return slam
 
@@ -139,7 +142,7 @@ def test_mapping_goes_on_in_the_same_frame_with_new_ids(mapped):
 
 
 def test_a_map_that_many_loops_have_bent_is_said_to_be_bent(mapped, caplog):
-    saved, slam = save_slam(mapped, CAMERA), StereoSlam(CAMERA, SETTINGS)
+    saved, slam = save_slam(mapped, CAMERA), equipped_slam(CAMERA, SETTINGS)
     bent = saved.parts['slam']['keyframe_T_camera_world'].copy()
     bent[:, :3, 0] *= 1.05
     load_slam(

@@ -13,7 +13,8 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from segfloor_ros.core.contracts import WheelPose
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import invert
-from segfloor_ros.core.plugins.saved_slam import (
+from segfloor_ros.core.plugins.assembly import equipped_slam
+from segfloor_ros.core.plugins.maps.saved_slam import (
     last_pose_of,
     last_pose_values,
     load_slam,
@@ -21,7 +22,7 @@ from segfloor_ros.core.plugins.saved_slam import (
 )
 from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.settings import StereoSlamSettings
-from segfloor_ros.core.slam.stereo_slam import HARDLY_BEGUN, StereoSlam
+from segfloor_ros.core.slam.stereo_slam import HARDLY_BEGUN
 
 SETTINGS = StereoSlamSettings(num_features=600)
 ROOM, OTHER = StereoRoom(), StereoRoom(seed=77)
@@ -47,13 +48,13 @@ def frames():
 
 def broken_off(frames, measured=()):
     """Return what goes on after the last of the frames."""
-    slam, measured = StereoSlam(CAMERA, SETTINGS, MOUNT), list(measured)
+    slam, measured = equipped_slam(CAMERA, SETTINGS, MOUNT), list(measured)
     for frame in frames:
         while measured and measured[0].stamp_ns <= frame.stamp_ns + 20_000_000:
             slam.add(measured.pop(0))
         slam.process(frame)
     last = last_pose_of(json.loads(json.dumps(last_pose_values(slam.last_pose))))
-    again = StereoSlam(CAMERA, SETTINGS)
+    again = equipped_slam(CAMERA, SETTINGS)
     load_slam(again, CAMERA, save_slam(slam, CAMERA), 'kept map', last=last)
     return again, last
 

@@ -9,9 +9,9 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.mapping.keyframe_mapping import find_duplicates
 from segfloor_ros.core.slam.settings import StereoSlamSettings
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.tracking.images import FeatureExtractor, Images
 from segfloor_ros.core.slam.tracking.map_tracking import LocalMap, Tracker
 
@@ -26,7 +26,7 @@ def drive(slam, room, poses, change=lambda frame: frame):
 
 
 def test_what_is_seen_again_is_not_mapped_twice():
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     there = [planar_pose(0.05 * k, 0, 0.04 * k) for k in range(12)]
     last = drive(slam, StereoRoom(), there + there[::-1])
     assert len(np.unique(last.point_id)) > 200
@@ -46,7 +46,7 @@ def test_points_of_a_place_are_tracked_again_though_none_of_them_was_seen_lately
 @pytest.mark.parametrize('seed', [0, 1, 2])
 def test_patches_give_the_pose_better_than_corners(seed):
     room = StereoRoom(seed)
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     slam.process(room.frame(0, planar_pose(0, 0, 0)))
     moved = planar_pose(0.06, 0.02, 0.05)
     frame = room.frame(1, moved)

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from segfloor_ros.core.contracts import FrameResult, MovingPoints
-from segfloor_ros.core.geometry import invert, make_transform, se3_exp
+from segfloor_ros.core.geometry import invert, make_transform
 from segfloor_ros.core.slam.held_results import in_map
+from segfloor_ros.core.twists import se3_exp
 
 RNG = np.random.default_rng(11)
 T_BASE_LEFT = se3_exp(np.array([0.3, -0.1, 0.5, -1.4, 0.2, -1.5]))

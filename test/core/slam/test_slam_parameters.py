@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.core.pipeline import make_slam
+from segfloor_ros.core.plugins.assembly import equipped_slam, make_slam
 from segfloor_ros.core.slam.settings import StereoSlamSettings
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.tracking.images import FeatureExtractor
 
 BUDGET = 600
@@ -23,7 +22,7 @@ def test_weak_corners_are_found_down_to_the_threshold(threshold, fewest, most):
 def test_a_motion_faster_than_a_robot_drives_is_not_believed(max_speed_mps, is_believed):
     room = StereoRoom()
     settings = StereoSlamSettings(num_features=BUDGET, max_speed_mps=max_speed_mps)
-    slam = StereoSlam(CAMERA, settings, MOUNT)
+    slam = equipped_slam(CAMERA, settings, MOUNT)
     # The last step is 0.3 m within 0.1 s.
     frames = [room.frame(k, planar_pose(x, 0, 0)) for k, x in enumerate((0.0, 0.05, 0.1, 0.4))]
     tracked = [slam.process(frame)[0].tracked for frame in frames]

@@ -4,7 +4,7 @@ import numpy as np
 from hand_made_maps import CAMERA, add, keyframe
 
 from segfloor_ros.core.contracts import NO_POINT
-from segfloor_ros.core.plugins.saved_slam import map_to_arrays
+from segfloor_ros.core.plugins.maps.map_arrays import map_to_arrays
 from segfloor_ros.core.slam.places import loop_closing
 from segfloor_ros.core.slam.rig import Rig
 from segfloor_ros.core.slam.sparse_map import Match, PointRows, SparseMap, features_of

@@ -11,8 +11,8 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.contracts import NO_POINT, StereoFrame
 from segfloor_ros.core.geometry import invert, rotation_angle
+from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.settings import StereoSlamSettings
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=800)
 
@@ -35,7 +35,7 @@ def frames():
 
 @pytest.fixture(scope='module')
 def results(frames):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     return [result for frame in frames for result in slam.process(frame)]
 
 
@@ -89,7 +89,7 @@ def test_odom_is_continuous_at_keyframes(results):
 
 
 def test_repeats_to_the_bit(frames, results):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     again = [result for frame in frames for result in slam.process(frame)]
     for a, b in zip(results, again, strict=True):
         np.testing.assert_array_equal(a.T_odom_base, b.T_odom_base)
@@ -97,7 +97,7 @@ def test_repeats_to_the_bit(frames, results):
 
 
 def test_the_background_thread_loses_nothing(frames):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT, background=True)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT, background=True)
     results = [result for frame in frames for result in slam.process(frame)]
     slam.close()
     assert not [t for t in threading.enumerate() if t.name.startswith('adjustment')]
@@ -113,7 +113,7 @@ def test_the_background_thread_loses_nothing(frames):
 @pytest.mark.parametrize('is_late', [False, True])
 def test_pose_and_images_of_a_keyframe_are_announced_before_the_map_takes_it_in(frames, is_late):
     """Before its features are measured; late where an adjustment has still to move the map."""
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT, background=True)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT, background=True)
     announced, observed = {}, []
     observe, take_adjustment = slam.front_end.observe, slam._take_adjustment
 
@@ -156,7 +156,7 @@ def test_pose_and_images_of_a_keyframe_are_announced_before_the_map_takes_it_in(
 
 def test_a_keyframe_is_announced_late_while_the_whole_map_may_move(frames):
     """And after a frame that did not become one: nobody waits for more than one in vain."""
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT, background=True)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT, background=True)
     take_adjustment, observe = slam._take_adjustment, slam.front_end.observe
     slam._take_adjustment = lambda wait: take_adjustment(wait=True)
     observed, early, is_blank = [], [], [False]
@@ -195,7 +195,7 @@ def test_a_keyframe_is_announced_late_while_the_whole_map_may_move(frames):
 
 
 def test_an_adjustment_moves_the_camera_with_its_keyframe_and_leaves_odom(frames):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     for frame in frames[:12]:
         before = slam.process(frame)[-1]
     last = slam.map.keyframes[-1]
@@ -227,7 +227,7 @@ def test_covariance_is_a_covariance(results):
 
 
 def test_black_frames_are_lost_and_tracking_returns(frames):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     results = []
     for frame in frames:
         if 10 <= frame.index < 14:
@@ -244,7 +244,7 @@ def test_black_frames_are_lost_and_tracking_returns(frames):
 
 
 def test_a_frozen_camera_is_lost_and_tracking_returns(frames):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     results = []
     for frame in frames[:18]:
         if 10 <= frame.index < 13:
@@ -257,7 +257,7 @@ def test_a_frozen_camera_is_lost_and_tracking_returns(frames):
 
 
 def test_images_that_come_twice_are_repeated_and_the_motion_goes_on(frames):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     results = []
     for frame in frames[:20]:
         if frame.index in (6, 8, 14):
@@ -273,7 +273,7 @@ def test_images_that_come_twice_are_repeated_and_the_motion_goes_on(frames):
 
 
 def test_a_jump_without_any_prediction_is_found_by_descriptors(frames):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     room = StereoRoom()
     slam.process(room.frame(0, planar_pose(0, 0, 0)))
     far = planar_pose(0.5, 0.2, 0.3)  # 17 degrees: 50 of 320 pixels
@@ -285,7 +285,7 @@ def test_a_jump_without_any_prediction_is_found_by_descriptors(frames):
 def test_who_was_lost_must_find_what_should_be_there(frames, monkeypatch):
     monkeypatch.setattr('segfloor_ros.core.slam.tracking.front_end.MIN_FOUND', 1.0)
     monkeypatch.setattr('segfloor_ros.core.slam.places.place_recognition.CHANCE_SHARE', 1.0)
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     black = np.zeros_like(frames[0].left)
     tracked = []
     for frame in frames[:8]:
@@ -299,7 +299,7 @@ def test_who_was_lost_must_find_what_should_be_there(frames, monkeypatch):
 
 
 def test_teleported_camera_is_lost_not_wrong(frames):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     other = StereoRoom(seed=99)
     results = []
     for frame in frames[:15]:
@@ -310,7 +310,7 @@ def test_teleported_camera_is_lost_not_wrong(frames):
 
 
 def test_standing_still_adds_nothing(frames):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     for k in range(60):
         still = StereoFrame(k, k * 100_000_000, frames[0].left, frames[0].right)
         result = slam.process(still)[0]
@@ -332,7 +332,7 @@ def test_results_wait_for_the_mount_and_none_is_lost(frames):
             self.mount = MOUNT if self.seen == 3 else None
             self.is_final = self.mount is not None
 
-    slam = StereoSlam(CAMERA, SETTINGS, None, LateMeter())
+    slam = equipped_slam(CAMERA, SETTINGS, None, LateMeter())
     batches = [slam.process(frame) for frame in frames]
     sizes = [len(batch) for batch in batches]
     first = next(i for i, size in enumerate(sizes) if size)
@@ -344,7 +344,7 @@ def test_results_wait_for_the_mount_and_none_is_lost(frames):
 
 def test_waiting_for_the_mount_does_not_fill_the_memory(frames, monkeypatch):
     monkeypatch.setattr('segfloor_ros.core.slam.held_results.MAX_HELD_KEYFRAMES', 3)
-    slam = StereoSlam(CAMERA, SETTINGS)
+    slam = equipped_slam(CAMERA, SETTINGS)
     for frame in frames[:-1]:
         assert slam.process(frame) == []
     keyframes = len(slam.map.keyframes)

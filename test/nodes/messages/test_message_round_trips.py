@@ -24,8 +24,9 @@ from segfloor_ros.core.contracts import (
     VDisparity,
 )
 from segfloor_ros.core.errors import CalibrationError, InputError
-from segfloor_ros.core.geometry import R_ROS_OPTICAL, make_transform, se3_exp
+from segfloor_ros.core.geometry import R_ROS_OPTICAL, make_transform
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
+from segfloor_ros.core.twists import se3_exp
 from segfloor_ros.nodes.messages import arrays, poses
 from segfloor_ros.nodes.messages.arrays import (
     camera_info_message,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera, is_disparity
 from segfloor_ros.core.camera.pixels import Region, shrunk
-from segfloor_ros.core.contracts import Mount, MovingPoints, StereoFrame
+from segfloor_ros.core.contracts import Mount, Placed, Searched, StereoFrame
 from segfloor_ros.core.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.core.plugins.moving.scene_flow import (
     MAX_MOVING_SHARE,
@@ -35,7 +35,6 @@ from segfloor_ros.core.plugins.moving.scene_flow import (
 )
 from segfloor_ros.core.slam.places.views import is_due
 from segfloor_ros.core.slam.rig import MIN_DEPTH_M
-from segfloor_ros.core.slam.sparse_map import KeyframeRecord
 from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, MAJORITY
 from segfloor_ros.core.slam.tracking.pose import FLOOR_M
 
@@ -67,31 +66,18 @@ MIN_AREA_PX = BLOCK_PX * BLOCK_PX
 
 
 @dataclass(frozen=True)
-class Searched:
-    """What a search found. disparity: (h, w) px of the shrunk image, 0 where none was found.
-    moving: what moves in it, (h, w), 255. region: the same in the image, None for nothing. points:
-    of what moves, in the world.
-    """
-
-    disparity: Disparity
-    moving: NDArray[np.uint8]
-    region: Region | None
-    points: MovingPoints
-
-
-@dataclass(frozen=True)
 class DepthView:
     """What an earlier keyframe saw: the disparity (h, w) in px of the shrunk image, 0 where none
     was found, and the largest and smallest one around each pixel.
     """
 
-    keyframe: KeyframeRecord
+    keyframe: Placed
     disparity: Disparity
     nearest: Disparity
     farthest: Disparity
 
     @staticmethod
-    def of(keyframe: KeyframeRecord, disparity: Disparity) -> DepthView:
+    def of(keyframe: Placed, disparity: Disparity) -> DepthView:
         """Prepare the disparity of a keyframe for comparisons."""
         around = np.ones((3, 3), np.uint8)
         known = np.where(disparity > 0, disparity, np.float32(np.inf))
@@ -105,11 +91,15 @@ class MovingRegions:
 
     def __init__(self, camera: StereoCamera) -> None:
         self._camera, self._small = camera, SmallCamera(camera)
-        self._flow = SceneFlow(self._small)
         self._matcher = cv2.StereoSGBM_create(
             0, DISPARITIES, BLOCK_PX, P1, P2, disp12MaxDiff=1, uniquenessRatio=5,
             speckleWindowSize=SPECKLE_PX, speckleRange=1, mode=cv2.STEREO_SGBM_MODE_HH4,
         )  # fmt: skip
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all frames: where the next ones are relative to them is not known."""
+        self._flow = SceneFlow(self._small)
         self._pair: tuple[NDArray[np.uint8], NDArray[np.uint8] | None]
         self._views: deque[DepthView] = deque(maxlen=KEPT_VIEWS)
         self._found: NDArray[np.uint8] | None = None
@@ -134,17 +124,9 @@ class MovingRegions:
         found = self.find(disparity, T_camera_world, mount, self._flow.votes(view))
         moving, self._found = self._held(found, disparity), found
         self._flow.remember(replace(view, moving=moving))
-        look = Look(frame.stamp_ns, left, self._positions(disparity, T_camera_world))
+        look = Look(frame.stamp_ns, left, _positions(self._small, disparity, T_camera_world))
         points = self._meter.measure(look, moving)
         return Searched(disparity, moving, self._enlarged(moving), points)
-
-    def _positions(self, disparity: Disparity, T_camera_world: Array) -> Array:
-        """Return where each pixel is, (h, w, 3) in the world, NaN where there is no disparity."""
-        depth_m = np.where(
-            disparity > 0, self._small.disparity_m / np.maximum(disparity, 1e-3), np.nan
-        )
-        points = (self._small.rays * depth_m.ravel()).T.astype(np.float64)
-        return transform_points(invert(T_camera_world), points).reshape(*disparity.shape, 3)
 
     def seen_through(self, disparity: Disparity, points: Array) -> NDArray[np.bool_]:
         """Return at which points (N, 3) of the left optical frame nothing is: the image shows what
@@ -193,7 +175,7 @@ class MovingRegions:
         gain = float(np.clip(spread_l[0, 0] / max(float(spread_r[0, 0]), 1.0), *GAINS))
         self._exposure = gain, float(mean_l[0, 0]) - gain * float(mean_r[0, 0])
 
-    def remember(self, keyframe: KeyframeRecord, disparity: Disparity) -> None:
+    def remember(self, keyframe: Placed, disparity: Disparity) -> None:
         """Take in what a keyframe saw."""
         self._views.append(DepthView.of(keyframe, disparity))
 
@@ -402,3 +384,10 @@ def _edges(disparity: Disparity) -> NDArray[np.bool_]:
     """Return where (h, w) something nearer begins."""
     nearest = cv2.dilate(disparity, np.ones((3, 3), np.uint8))
     return np.asarray(nearest - disparity > 2 * TOLERANCE_PX)
+
+
+def _positions(small: SmallCamera, disparity: Disparity, T_camera_world: Array) -> Array:
+    """Return where each pixel is, (h, w, 3) in the world, NaN where there is no disparity."""
+    depth_m = np.where(disparity > 0, small.disparity_m / np.maximum(disparity, 1e-3), np.nan)
+    points = (small.rays * depth_m.ravel()).T.astype(np.float64)
+    return transform_points(invert(T_camera_world), points).reshape(*disparity.shape, 3)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera, is_disparity
-from segfloor_ros.core.contracts import StereoFrame
+from segfloor_ros.core.contracts import InputFault, StereoFrame
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.plugins.rig.estimates import (
     LEAST_NOISE_PX,
@@ -71,24 +71,6 @@ WHITE_SHARE = 1 / 3
 
 SAME_EYES, EYES_RATIO = 1.07, 1.25
 """Two good cameras with exposures of their own differ by up to the one; the other is a fault."""
-
-
-@dataclass(frozen=True)
-class InputFault:
-    """What is wrong with the images: `fault` in a word, a figure with its unit, what was found in
-    words that go on after the name of the images, and what to do.
-    """
-
-    fault: str
-    value: float
-    unit: str
-    finding: str
-    remedy: str
-    images: str = 'left and right images'
-
-    def line(self, images: str = '') -> str:
-        """Return the fault in one line. images: their name, if they have one of their own."""
-        return f'{images or self.images} {self.finding}; {self.remedy}'
 
 
 FAULTS = {

@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import MAX_OFFSET_PX, StereoCamera
-from segfloor_ros.core.geometry import Array, se3_exp, skew, transform_points
+from segfloor_ros.core.geometry import Array, transform_points
+from segfloor_ros.core.twists import se3_exp, skew
 
 WIDTH_PX = 320
 """Images are shrunk to about this width."""

@@ -23,7 +23,7 @@ from segfloor_ros.core.contracts import (
     KeyframePath,
     Mount,
 )
-from segfloor_ros.core.files.results import Arrays, joined, split
+from segfloor_ros.core.files.arrays import Arrays, joined, split
 from segfloor_ros.core.geometry import transform_points
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from segfloor_ros.core.plugins.semantics.outputs import UNLABELLED
@@ -195,6 +195,14 @@ def _likeliest(
     return best
 
 
+def numbered(grid: OccupancyGrid, cells: NDArray[np.uint8]) -> OccupancyGrid:
+    """Return a grid with the numbers of classes (rows, columns) in place of its cells, unknown
+    where there is none; a map has room for the first 101.
+    """
+    numbers = np.where(cells <= OCCUPIED, cells, UNKNOWN).astype(np.int8)
+    return OccupancyGrid(numbers, grid.resolution_m, grid.origin_xy_m)
+
+
 @dataclass(frozen=True)
 class Labels:
     """What is known of a whole map. classes: names by number. cells: (rows, columns) of its grid,
@@ -204,11 +212,3 @@ class Labels:
     classes: list[str]
     cells: NDArray[np.uint8] | None
     points: NDArray[np.uint8] | None
-
-
-def numbered(grid: OccupancyGrid, cells: NDArray[np.uint8]) -> OccupancyGrid:
-    """Return a grid with the numbers of classes (rows, columns) in place of its cells, unknown
-    where there is none; a map has room for the first 101.
-    """
-    numbers = np.where(cells <= OCCUPIED, cells, UNKNOWN).astype(np.int8)
-    return OccupancyGrid(numbers, grid.resolution_m, grid.origin_xy_m)

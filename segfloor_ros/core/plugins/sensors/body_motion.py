@@ -8,21 +8,16 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from segfloor_ros.core.contracts import Measurement, RelativeMotion, WheelPose
+from segfloor_ros.core.contracts import Measurement, RelativeMotion, Up, WheelPose
 from segfloor_ros.core.geometry import (
     Array,
-    adjoint,
     invert,
     is_within,
     make_transform,
     rotation_from_angles,
 )
 from segfloor_ros.core.plugins.sensors.gyroscope import MOMENT_NS, Gyroscope
-from segfloor_ros.core.plugins.sensors.inertial_odometry import (
-    SPEED_SIGMA,
-    Gravity,
-    InertialOdometry,
-)
+from segfloor_ros.core.plugins.sensors.inertial_odometry import Gravity, InertialOdometry
 from segfloor_ros.core.plugins.sensors.wheel_odometry import (
     SIGMA_ROOT_M,
     SIGMA_ROOT_RAD,
@@ -34,7 +29,8 @@ from segfloor_ros.core.plugins.sensors.wheel_odometry import (
     wheels_m,
     yaw_of,
 )
-from segfloor_ros.core.slam.thresholds import ENOUGH
+from segfloor_ros.core.slam.thresholds import ENOUGH, SPEED_SIGMA
+from segfloor_ros.core.twists import adjoint
 
 SIGMA_TURN_SHARE = 0.03
 """Error of a turn measured by wheels, as a share of it."""
@@ -94,6 +90,15 @@ class BodyMotion:
     def latest_wheels(self) -> list[WheelPose]:
         """The last poses that the wheels measured: enough for the motion since."""
         return self._wheels.latest
+
+    @property
+    def up_world(self) -> Up | None:
+        """Up in the world, as the accelerometer has it; None before enough is known."""
+        return self.gravity.up_world
+
+    def up_camera(self, T_odom_camera: Array) -> Up | None:
+        """Return up in the camera's axes as the latest measurement has it, given out once."""
+        return self.gravity.up_camera(T_odom_camera)
 
     def turn(self, before_ns: int, now_ns: int) -> tuple[Array, float] | None:
         """Return R_now_before (3, 3) of the camera as the gyroscope measures it, and the standard

@@ -15,8 +15,9 @@ import numpy as np
 
 from segfloor_ros.core.camera.recording import MAX_LAG_S
 from segfloor_ros.core.contracts import ImuSample
-from segfloor_ros.core.geometry import Array, rotation_angle, rotation_vectors, rotations_by
+from segfloor_ros.core.geometry import Array, rotation_angle
 from segfloor_ros.core.slam.rig import is_gated
+from segfloor_ros.core.twists import rotation_vectors, rotations_by
 
 LATE_NS = 100_000_000
 """Messages may be so late; until then what is measured is taken to go on as it did."""

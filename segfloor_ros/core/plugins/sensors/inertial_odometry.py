@@ -19,11 +19,7 @@ from segfloor_ros.core.contracts import UNKNOWN_COVARIANCE, Up
 from segfloor_ros.core.geometry import Array, rotation_angle
 from segfloor_ros.core.plugins.sensors.gyroscope import MOMENT_NS, SIGMA_SEEN_M, STEP_NS, Gyroscope
 from segfloor_ros.core.slam.rig import is_gated
-from segfloor_ros.core.slam.thresholds import PROOF
-
-SPEED_SIGMA = 0.5
-"""Error of a speed that nothing measures, m/s: at first, or by wheels that slip; and how much one
-changes that is taken for constant, m/s per root second."""
+from segfloor_ros.core.slam.thresholds import PROOF, SPEED_SIGMA
 
 SIGMA_INTEGRATED = 0.01
 """Error of a speed that is integrated, m/s per root second: noise and shaking."""

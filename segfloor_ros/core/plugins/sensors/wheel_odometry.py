@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from segfloor_ros.core.contracts import WheelPose
-from segfloor_ros.core.geometry import Array, between, invert, make_transform, rotation_from_angles
+from segfloor_ros.core.geometry import Array, invert, make_transform, rotation_from_angles
 from segfloor_ros.core.plugins.sensors.gyroscope import (
     LATE_NS,
     STEP_NS,
@@ -16,6 +16,7 @@ from segfloor_ros.core.plugins.sensors.gyroscope import (
     lag_in_words,
 )
 from segfloor_ros.core.slam.rig import GATE, chi2_limit
+from segfloor_ros.core.twists import between
 
 
 class WheelOdometry:

@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from segfloor_ros.core.contracts import Up
-from segfloor_ros.core.files.results import Arrays
+from segfloor_ros.core.files.arrays import Arrays
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.plugins.saved_slam import fill_map, map_to_arrays
 from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     GlobalResult,
     apply_global,
@@ -25,9 +24,9 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     solve_global,
 )
 from segfloor_ros.core.slam.mapping.keyframe_mapping import LocalMapper
+from segfloor_ros.core.slam.optional import KnownMap, MapKeeper
 from segfloor_ros.core.slam.places.loop_closing import (
     Closing,
-    KnownMap,
     apply_closing,
     plan_closing,
     solve_closing,
@@ -71,7 +70,8 @@ class BackEnd:
     loop that moves it far or once it has grown.
 
     background: on threads beside tracking; else at once, so that the outcome does not depend on
-    timing. Tracking never waits for an adjustment of the whole map. submap: what the map is.
+    timing. Tracking never waits for an adjustment of the whole map. keeper: of maps as arrays.
+    submap: what the map is.
     """
 
     def __init__(
@@ -80,7 +80,9 @@ class BackEnd:
         sparse_map: SparseMap,
         front_end: FrontEnd,
         background: bool,
+        keeper: MapKeeper,
     ) -> None:
+        self.keeper = keeper
         self._front_end = front_end
         self._longest_frames = settings.keyframe_max_frames
         self.mapper = LocalMapper(sparse_map)
@@ -151,8 +153,7 @@ class BackEnd:
         recognised.
         """
         of_drive = self.submap is Submap.KNOWN
-        known = map_to_arrays(self._map) | self.places.to_arrays()
-        self._known = KnownMap(self._map, known, of_drive)
+        self._known = self.keeper.hold(self._map, self.places, of_drive)
         self.reset()
         self.submap = Submap.LOST
 
@@ -227,11 +228,11 @@ class BackEnd:
         measured: Arrays = {'disparity_offset': np.array([offset.value_px, offset.information])}
         if self.submap is Submap.LOST and self._known is not None:
             return self._known.to_arrays() | measured
-        return map_to_arrays(self._map) | self.places.to_arrays() | measured
+        return self.keeper.to_arrays(self._map) | self.places.to_arrays() | measured
 
     def from_arrays(self, arrays: Arrays) -> None:
         """Go on with what `to_arrays` returned."""
-        fill_map(self._map, arrays)
+        self.keeper.fill(self._map, arrays)
         self.places.from_arrays(arrays)
         self._rig.offset.estimate = OffsetEstimate(*arrays['disparity_offset'].tolist())
 

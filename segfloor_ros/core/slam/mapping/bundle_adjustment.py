@@ -23,7 +23,6 @@ from segfloor_ros.core.geometry import (
     Array,
     invert,
     make_transform,
-    se3_exp,
     transform_points,
     without_drift,
 )
@@ -51,6 +50,7 @@ from segfloor_ros.core.slam.rig import (
 )
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, LoopEdge, SparseMap
 from segfloor_ros.core.slam.thresholds import ENOUGH, NEARLY_ALL, POINTS_PER_KEYFRAME
+from segfloor_ros.core.twists import se3_exp
 
 CONVERGED = 2e-3
 """Stop at this relative decrease of the cost; the next keyframe goes on from there."""

@@ -32,7 +32,7 @@ from scipy.sparse.linalg import splu
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import RelativeMotion, Up
-from segfloor_ros.core.geometry import Array, adjoint, invert, se3_logs
+from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.slam.rig import (
     LOCAL_KEYFRAMES,
     SMALLEST,
@@ -43,6 +43,7 @@ from segfloor_ros.core.slam.rig import (
     with_moment,
 )
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, LoopEdge
+from segfloor_ros.core.twists import adjoint, se3_logs
 
 MANY, LEFT = 300, 0.01
 """From so many cameras on, gradients are faster than a factor; they end where less than this share

@@ -1,64 +1,32 @@
 """Closing a loop: keyframes and points move so that both ends meet, and become one map.
 
-A known map that was saved by another drive, or made by this one before it got lost, stays beside
-the drive's own. Once several keyframes in a row see it and agree on where it lies, the drive's own
-map is brought into it (Campos et al., ORB-SLAM3, IEEE T-RO 2021, section VI: map merging).
-
 Pose-graph optimisation: keyframes move until their relative poses fit best.
 
 Minimises the sum of e^T W e with e_ij = log(T_i_j Z_i_j^-1) over T_i_j = T_i T_j^-1 by
 Levenberg-Marquardt (Grisetti et al., A Tutorial on Graph-Based SLAM, 2010). Edges can be robust:
 one that contradicts the others loses its weight (Agarwal et al., Robust Map Optimization
 using Dynamic Covariance Scaling, ICRA 2013).
-
-Two saved maps, of several robots or of days that were mapped apart, become one in the same way: the
-keyframes of the second are looked for in the first by what they observed, one after the other.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import NO_POINT
-from segfloor_ros.core.files.results import Arrays
-from segfloor_ros.core.geometry import Array, adjoint, invert, se3_exp, se3_log, se3_logs
-from segfloor_ros.core.plugins.saved_slam import fill_map, map_to_arrays, moved
-from segfloor_ros.core.slam.mapping.bundle_adjustment import (
-    apply_global,
-    copy_map,
-    move_keyframes,
-    solve_global,
-)
+from segfloor_ros.core.geometry import Array, invert
+from segfloor_ros.core.slam.mapping.bundle_adjustment import move_keyframes
 from segfloor_ros.core.slam.mapping.keyframe_mapping import fuse_duplicates
 from segfloor_ros.core.slam.mapping.normal_equations import solve_symmetric
-from segfloor_ros.core.slam.places.loops import LoopDetector, PlaceMatcher, drift
-from segfloor_ros.core.slam.places.place_recognition import (
-    FloorIndex,
-    PlaceRecognition,
-    Relocaliser,
-)
-from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, OffsetEstimate, Rig, chi2_limit, is_gated
-from segfloor_ros.core.slam.sparse_map import LINK_SIGMA, KeyframeRecord, LoopEdge, Match, SparseMap
-from segfloor_ros.core.slam.thresholds import PROOF
-from segfloor_ros.core.slam.tracking.images import Features
-from segfloor_ros.core.slam.tracking.map_tracking import Pixels
+from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, chi2_limit, is_gated
+from segfloor_ros.core.slam.sparse_map import LINK_SIGMA, LoopEdge, Match, SparseMap
 from segfloor_ros.core.slam.tracking.pose import CONVERGED
-from segfloor_ros.core.slam.tracking.track import Track
+from segfloor_ros.core.twists import adjoint, se3_exp, se3_log, se3_logs
 
 STEPS = 20
-
-TIMES_SURE = 2
-"""Where nothing limits where a place can be, so many times the evidence of a loop is asked for:
-walls with the same paper, and shelves that stand twice in a building, are taken for one now and
-then."""
-
-OFFSET = 'disparity_offset'
-"""What a map knows of the disparity offset, by name."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +50,7 @@ def plan_closing(sparse_map: SparseMap, matches: list[Match]) -> Closing:
     keyframes = sparse_map.keyframes
     poses = np.stack([k.T_camera_world for k in keyframes])
     i, j = sparse_map.links()
-    new = [_edge(sparse_map, match) for match in matches]
+    new = [loop_edge(sparse_map, match) for match in matches]
     loops = [*sparse_map.loops, *new]
     T_loops = np.stack([loop.T_i_j for loop in loops])
     of_links = np.tile(np.repeat(LINK_SIGMA, 3), (len(i), 1))
@@ -102,7 +70,8 @@ def plan_closing(sparse_map: SparseMap, matches: list[Match]) -> Closing:
     return Closing(matches, new, graph)
 
 
-def _edge(sparse_map: SparseMap, match: Match) -> LoopEdge:
+def loop_edge(sparse_map: SparseMap, match: Match) -> LoopEdge:
+    """Return the loop that a match makes."""
     place = sparse_map.keyframes[match.place]
     T_i_j = match.T_camera_world @ place.T_world_camera
     return LoopEdge(match.keyframe, match.place, T_i_j, by_floor=len(match.rows) == 0)
@@ -242,144 +211,3 @@ def _solve(graph: PoseGraph, poses: Array, error: Array, weight: Array, damping:
     damped = H + sparse.dia_array((added, [0]), shape=H.shape).tocsc()
     step[moving] = -solve_symmetric(damped.tocsc(), g)
     return step.reshape(-1, 6)
-
-
-class KnownMap:
-    """The known map, beside the drive's own. of_drive: whether this drive made it, and got lost."""
-
-    def __init__(self, own: SparseMap, arrays: Arrays, of_drive: bool) -> None:
-        self._own = own
-        self.of_drive = of_drive
-        self._map = SparseMap(own.rig)
-        fill_map(self._map, arrays)
-        self._places = PlaceRecognition(self._map)
-        self._places.from_arrays(arrays)
-        self._relocaliser = Relocaliser(self._map, self._places)
-        self._matcher = PlaceMatcher(own, self._map, self._places, TIMES_SURE * PROOF)
-        self._floors = FloorIndex(self._map.keyframes)
-
-    @property
-    def num_keyframes(self) -> int:
-        """How large the known map is."""
-        return len(self._map.keyframes)
-
-    def recognise(self, keyframe: KeyframeRecord, images: Pixels) -> bool:
-        """Whether enough keyframes in a row see the known map, this one the last of them. One whose
-        floor is seen elsewhere than its look says nothing: shelves and pictures are all over a
-        building, and so are floors.
-        """
-        anywhere = np.ones(len(self._map.keyframes), bool)
-        by_look = self._matcher.look(keyframe, images, anywhere, ~anywhere)
-        by_floor = self._matcher.look_at_floor(keyframe, self._floors.like(keyframe.ground))
-        match = by_look or by_floor
-        is_possible = match is not None and self._is_possible(keyframe, match)
-        if by_look and by_floor and not self._matcher.agree(by_look, by_floor):
-            is_possible = False
-        return self._matcher.add(match if is_possible else None)
-
-    def _is_possible(self, keyframe: KeyframeRecord, match: Match) -> bool:
-        if self.of_drive and not self._matcher.is_within_reach(match):
-            return False
-        return not self._matcher.objection(keyframe, match)
-
-    def find(
-        self, images: Pixels, features: Features, stamp_ns: int
-    ) -> tuple[Track | None, dict[int, Track]]:
-        """Return a frame with its pose in the known map, once several in a row were found there,
-        and those, by stamp.
-        """
-        found = self._relocaliser.find(images, features, stamp_ns)
-        return found, self._relocaliser.take_proof()
-
-    def _own_ids(self, match: Match) -> NDArray[np.int32]:
-        """Return the stable ids (N,) that the points of a match have in the drive's own map, -1
-        where it has none.
-        """
-        keyframe = self._own.keyframes[match.keyframe]
-        own = np.full(len(match.rows), NO_POINT, np.int32)
-        if not keyframe.is_thin:
-            own = keyframe.point_id[match.rows]
-        return np.where(own != NO_POINT, self._own.stable_id[own], np.int32(NO_POINT))
-
-    def merge(self, own_words: Arrays) -> Arrays:
-        """Merge the drive's own map into the known one, with the same ids and stamps. Returns the
-        words of all keyframes.
-        """
-        matches = self._matcher.matches
-        latest, own_ids = matches[-1], [self._own_ids(match) for match in matches]
-        T_known_own = invert(drift(self._own, latest))
-        before = len(self._map.keyframes)
-        arrays = moved(map_to_arrays(self._own), T_known_own)
-        known = self.to_arrays()
-        self.restore(known)
-        fill_map(self._own, arrays)
-        for match, ids in zip(matches, own_ids, strict=True):
-            edge = _edge(self._own, match)
-            self._own.loops.append(replace(edge, i=before + match.keyframe))
-            merge_pairs(self._own, self._rows(ids), self._rows(match.stable_ids))
-        fuse_latest(self._own, before + latest.keyframe)
-        return {name: np.concatenate([known[name], own_words[name]]) for name in own_words}
-
-    def to_arrays(self) -> Arrays:
-        """Return the known map and the words of its keyframes."""
-        return map_to_arrays(self._map) | self._places.to_arrays()
-
-    def restore(self, known: Arrays) -> None:
-        """Put the known map, as `to_arrays` returns it, in the place of the drive's own."""
-        self._own.reset()
-        fill_map(self._own, known)
-
-    def _rows(self, stable_ids: NDArray[np.int32]) -> NDArray[np.intp]:
-        """Return the rows (N,) of points in the merged map, -1 for those that are gone."""
-        rows = np.searchsorted(self._own.stable_id, stable_ids)
-        rows = np.minimum(rows, len(self._own.stable_id) - 1)
-        there = (self._own.stable_id[rows] == stable_ids) & self._own.alive[rows]
-        return np.where(there, rows, -1)
-
-
-def merge_slam(first: Arrays, second: Arrays, rig: Rig) -> Arrays | None:
-    """Return two maps as one; None where no place of the first is seen in the second. rig: of the
-    first, and of the second as the rig of the first would have measured it (`as_seen_by`), with ids
-    and stamps that come after those of the first.
-    """
-    rig.offset.estimate = OffsetEstimate(*first[OFFSET].tolist())
-    merged = SparseMap(rig)
-    fill_map(merged, second)
-    known = KnownMap(merged, first, of_drive=False)
-    alive = [keyframe for keyframe in merged.keyframes if keyframe.retired is None]
-    if not any(known.recognise(keyframe, keyframe.observations.exact()) for keyframe in alive):
-        return None
-    words = known.merge({name: second[name] for name in ('words', 'word_count')})
-    places = PlaceRecognition(merged)
-    places.from_arrays(words)
-    _close_loops(merged, places, len(first['keyframe_stamp_ns']))
-    return map_to_arrays(merged) | places.to_arrays() | {OFFSET: first[OFFSET]}
-
-
-def _close_loops(merged: SparseMap, places: PlaceRecognition, begin: int) -> None:
-    """Close the loops that keyframes from index `begin` on see, and adjust the whole map."""
-    loops = LoopDetector(merged, places)
-    for keyframe in merged.keyframes[begin:]:
-        if keyframe.retired is not None:
-            continue
-        matches = loops.detect(keyframe, keyframe.observations.exact())
-        if matches:
-            closing = plan_closing(merged, matches)
-            apply_closing(merged, closing, solve_closing(closing))
-    copied = copy_map(merged, merged.rig.offset.estimate, None)
-    apply_global(merged, solve_global(merged.rig.camera, copied, lambda: True))
-
-
-def as_seen_by(camera: StereoCamera, offset_px: float, own: StereoCamera, arrays: Arrays) -> Arrays:
-    """Return a map, made with camera `own`, as another rectified one would have measured it, whose
-    disparities have an offset.
-    """
-    zoom = np.array([camera.fx / own.fx, camera.fy / own.fy, 1.0])
-    zoom[2] = camera.disparity_times_depth / own.disparity_times_depth
-    before = np.array([own.cx, own.cy, float(arrays[OFFSET][0])])
-    now = np.array([camera.cx, camera.cy, offset_px])
-    uvd_px = (arrays['feature_uvd_px'].astype(np.float64) - before) * zoom + now
-    return arrays | {
-        'feature_uvd_px': uvd_px.astype(np.float32),
-        'feature_sigma_px': (arrays['feature_sigma_px'] * zoom).astype(np.float16),
-    }

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.core.files.results import Arrays, joined, split
+from segfloor_ros.core.files.arrays import Arrays, joined, split
 from segfloor_ros.core.geometry import Array, invert, is_within, transform_points
 from segfloor_ros.core.slam.places.views import COLUMNS, ROWS
 from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES

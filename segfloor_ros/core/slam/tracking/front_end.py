@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera, is_disparity
 from segfloor_ros.core.camera.pixels import Region, union
-from segfloor_ros.core.contracts import NO_POINT, LastPose, StereoFrame
+from segfloor_ros.core.contracts import NO_POINT, BodySensors, LastPose, StereoFrame
 from segfloor_ros.core.geometry import Array, transform_points
-from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.slam.places.place_recognition import (
     PlaceRecognition,
     Relocaliser,
@@ -64,7 +63,7 @@ class FrontEnd:
     """
 
     def __init__(
-        self, settings: StereoSlamSettings, sparse_map: SparseMap, body: BodyMotion
+        self, settings: StereoSlamSettings, sparse_map: SparseMap, body: BodySensors
     ) -> None:
         self.motion = CameraMotion(settings.max_speed_mps, body)
         self.local = LocalMap(sparse_map, settings.keyframe_max_frames)

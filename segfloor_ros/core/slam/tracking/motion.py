@@ -15,25 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.contracts import LastPose, RelativeMotion
+from segfloor_ros.core.contracts import BodySensors, LastPose, RelativeMotion
 from segfloor_ros.core.geometry import (
     Array,
-    adjoint,
     invert,
     is_within,
     make_transform,
     rotation_angle,
     rotation_from_angles,
-    se3_exp,
-    se3_log,
     without_drift,
 )
-from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
-from segfloor_ros.core.plugins.sensors.inertial_odometry import SPEED_SIGMA
 from segfloor_ros.core.slam.rig import is_gated
-from segfloor_ros.core.slam.thresholds import SAME
+from segfloor_ros.core.slam.thresholds import SAME, SPEED_SIGMA
 from segfloor_ros.core.slam.tracking.images import SMALL_WIDTH_PX
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate
+from segfloor_ros.core.twists import adjoint, se3_exp, se3_log
 
 MAX_TURN_RADPS = 6.0
 """A robot does not spin faster than once a second."""
@@ -85,7 +81,7 @@ class CameraMotion:
     while it is lost, `T_camera_world` turns on as a gyroscope measures.
     """
 
-    def __init__(self, max_speed_mps: float, body: BodyMotion) -> None:
+    def __init__(self, max_speed_mps: float, body: BodySensors) -> None:
         self._body = body
         self._max_speed_mps = max_speed_mps
         self.reset()
@@ -319,13 +315,23 @@ class KeyframeMotion:
 
     def add(self, measured: RelativeMotion | None) -> None:
         """Add the motion of a frame."""
-        self.motion = self.motion.then(measured) if self.motion and measured else None
+        self.motion = joined_motion(self.motion, measured) if self.motion and measured else None
 
     def moved(self, measured: RelativeMotion) -> tuple[Array, Array] | None:
         """Return the pose after the motion by wheels so far and one of a frame, with covariance."""
         if self.motion is None or not self.motion.by_wheels:
             return None
-        return _moved((self.T_camera_world, self.covariance), self.motion.then(measured))
+        return _moved((self.T_camera_world, self.covariance), joined_motion(self.motion, measured))
+
+
+def joined_motion(first: RelativeMotion, later: RelativeMotion) -> RelativeMotion:
+    """Return the motion over two stretches (Barfoot 2017, section 7.3.3, to second order)."""
+    A = adjoint(later.T_now_before)
+    return RelativeMotion(
+        later.T_now_before @ first.T_now_before,
+        A @ first.covariance @ A.T + later.covariance,
+        later.source if first.by_wheels else first.source,
+    )
 
 
 def _moved(before: tuple[Array, Array], motion: RelativeMotion) -> tuple[Array, Array]:

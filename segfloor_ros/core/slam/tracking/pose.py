@@ -17,14 +17,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import UNKNOWN_COVARIANCE
-from segfloor_ros.core.geometry import (
-    Array,
-    invert,
-    make_transform,
-    se3_exp,
-    se3_log,
-    transform_points,
-)
+from segfloor_ros.core.geometry import Array, invert, make_transform, transform_points
 from segfloor_ros.core.slam.rig import (
     MIN_DEPTH_M,
     SAME_PX,
@@ -39,6 +32,7 @@ from segfloor_ros.core.slam.rig import (
 from segfloor_ros.core.slam.sparse_map import SparseMap
 from segfloor_ros.core.slam.thresholds import ENOUGH, MAJORITY, PROOF
 from segfloor_ros.core.timing import timed
+from segfloor_ros.core.twists import se3_exp, se3_log
 
 ROUNDS, STEPS_PER_ROUND = 3, 6
 """Of an estimate; outliers are looked for anew in each round."""

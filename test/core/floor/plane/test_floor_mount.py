@@ -16,7 +16,7 @@ from segfloor_ros.core.floor.plane.mount import (
     disagreement,
 )
 from segfloor_ros.core.floor.plane.plane import mean_climb, shares
-from segfloor_ros.core.pipeline import Pipeline, make_slam
+from segfloor_ros.core.plugins.assembly import make_pipeline, make_slam
 from segfloor_ros.core.plugins.sensors.gyroscope import STEP_NS
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.nodes.configuration import resolve
@@ -305,7 +305,7 @@ def test_a_mount_that_later_looks_contradict_is_corrected_and_the_map_follows():
     stage = Patch((0.2, -2.0, 0.1), (1.2, 0, 0), (0, 4.0, 0), True, contrast=30.0, seed=5)
     scene = Scene([floor_patch(), wall(7.0), stage], camera=SMALL_CAMERA, noise_grey=1.0)
     every = resolve(assignments=['stereo_slam.keyframe_max_frames=1'])
-    pipeline = Pipeline(SMALL_CAMERA, every)
+    pipeline = make_pipeline(SMALL_CAMERA, every)
     results, heights_m = [], []
     for i in range(48):
         here = replace(mount, forward_m=0.1 * i)

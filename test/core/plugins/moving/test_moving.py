@@ -11,8 +11,8 @@ from stereo_room import CAMERA, MOUNT
 from segfloor_ros.core.camera.pixels import union
 from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.settings import StereoSlamSettings
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.tracking.images import dilate, is_inside
 
 FRAMES = 36
@@ -33,7 +33,7 @@ CROSSING = MovingDrive(crossing)
 @cache
 def run(drive, with_masks=False, detect_moving=True, **settings):
     own = StereoSlamSettings(detect_moving=detect_moving, **settings)
-    slam = StereoSlam(CAMERA, own, MOUNT)
+    slam = equipped_slam(CAMERA, own, MOUNT)
     results = []
     for index in range(FRAMES):
         frame = drive.frame(index)
@@ -99,7 +99,7 @@ def test_what_crosses_is_found_without_masks():
 
 def test_a_late_mask_takes_the_points_back_that_its_keyframe_has_made():
     drive = MovingDrive(standing)
-    slam = StereoSlam(CAMERA, StereoSlamSettings(detect_moving=False), MOUNT)
+    slam = equipped_slam(CAMERA, StereoSlamSettings(detect_moving=False), MOUNT)
     for index in range(12):
         slam.process(drive.frame(index))
     keyframe = slam.map.keyframes[-1]

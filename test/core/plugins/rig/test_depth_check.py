@@ -8,8 +8,8 @@ import pytest
 from camera_recordings import opened
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.contracts import StereoFrame
-from segfloor_ros.core.plugins.rig.check import InputFault, RigCheck
+from segfloor_ros.core.contracts import InputFault, StereoFrame
+from segfloor_ros.core.plugins.rig.check import RigCheck
 
 WIDTH, HEIGHT = 640, 480
 FRAME_NS = 33_000_000

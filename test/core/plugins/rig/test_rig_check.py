@@ -15,9 +15,9 @@ from chessboards import pose as board_pose
 from stereo_room import CAMERA, StereoRoom, planar_pose
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.contracts import StereoFrame
+from segfloor_ros.core.contracts import InputFault, StereoFrame
 from segfloor_ros.core.geometry import make_transform
-from segfloor_ros.core.plugins.rig.check import EVERY, RECENT, SETTLED_FRAMES, InputFault, RigCheck
+from segfloor_ros.core.plugins.rig.check import EVERY, RECENT, SETTLED_FRAMES, RigCheck
 
 FRAME_S = 0.1
 

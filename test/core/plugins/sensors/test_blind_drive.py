@@ -11,9 +11,9 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.contracts import ImuSample, StereoFrame, WheelPose
 from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.settings import StereoSlamSettings
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.tracking.images import Images
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate
 from segfloor_ros.core.slam.tracking.track import Track
@@ -60,7 +60,7 @@ def imu_samples():
 
 
 def drive(frames, *measurements):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     waiting = sorted((m for one in measurements for m in one), key=lambda m: m.stamp_ns)
     results = []
     for frame in frames:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.core.contracts import ImuSample, Mount, RelativeMotion, WheelPose
-from segfloor_ros.core.geometry import adjoint, invert, make_transform, se3_exp, se3_log
+from segfloor_ros.core.geometry import invert, make_transform
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.plugins.sensors.gyroscope import KEPT_NS, STEP_NS, Gyroscope, TimedSeries
 from segfloor_ros.core.plugins.sensors.wheel_odometry import (
@@ -19,6 +19,8 @@ from segfloor_ros.core.plugins.sensors.wheel_odometry import (
     Window,
     rotation_2d,
 )
+from segfloor_ros.core.slam.tracking.motion import joined_motion
+from segfloor_ros.core.twists import adjoint, se3_exp, se3_log
 
 MS = 1_000_000
 
@@ -326,7 +328,7 @@ def test_motions_add_up_with_their_covariances():
         RelativeMotion(se3_exp(rng.normal(size=6) * 0.3), np.diag(rng.uniform(1, 4, 6) * 1e-6))
         for _ in range(2)
     ]
-    together = parts[0].then(parts[1])
+    together = joined_motion(*parts)
     draws = []
     for _ in range(4000):
         noisy = [

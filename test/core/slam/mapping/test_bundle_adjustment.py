@@ -5,7 +5,7 @@ import pytest
 from bundle_problems import CAMERA, disturbed, make_problem
 
 from segfloor_ros.core.contracts import RelativeMotion
-from segfloor_ros.core.geometry import se3_exp, transform_points
+from segfloor_ros.core.geometry import transform_points
 from segfloor_ros.core.slam.mapping.bundle_adjustment import BundleProblem, adjust
 from segfloor_ros.core.slam.mapping.normal_equations import (
     Linearisation,
@@ -15,6 +15,7 @@ from segfloor_ros.core.slam.mapping.normal_equations import (
     with_factors,
 )
 from segfloor_ros.core.slam.rig import Observations, residuals
+from segfloor_ros.core.twists import se3_exp
 
 
 def test_returns_to_the_truth_from_a_disturbed_start():

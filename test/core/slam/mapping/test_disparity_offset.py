@@ -11,11 +11,12 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.camera.model import OFFSET_SIGMA_PX
 from segfloor_ros.core.contracts import StereoFrame
-from segfloor_ros.core.geometry import make_transform, se3_exp, transform_points
+from segfloor_ros.core.geometry import make_transform, transform_points
+from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.mapping.bundle_adjustment import adjust
 from segfloor_ros.core.slam.rig import DisparityOffset, OffsetEstimate
 from segfloor_ros.core.slam.settings import StereoSlamSettings
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
+from segfloor_ros.core.twists import se3_exp
 
 FRAMES, TURNED_FRAMES = 40, 21
 BENT = [
@@ -106,7 +107,7 @@ def frames(step_m, step_rad, offset_px, seed, contrast):
 
 def room_drive(offset_px=0.0, step_m=0.05, step_rad=0.0, seed=0, contrast=60.0, is_known=False):
     """Drive through the room, straight ahead unless other poses are given."""
-    slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
+    slam = equipped_slam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
     if is_known:
         slam.rig.offset = DisparityOffset(0.0, 1.0)
     seen = frames(step_m, step_rad, offset_px, seed, contrast)

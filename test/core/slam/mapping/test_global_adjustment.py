@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from segfloor_ros.core.contracts import NO_POINT, Up
-from segfloor_ros.core.geometry import invert, se3_exp, se3_log, transform_points
-from segfloor_ros.core.plugins.saved_slam import fill_map
+from segfloor_ros.core.geometry import invert, transform_points
+from segfloor_ros.core.plugins.maps.map_arrays import fill_map
 from segfloor_ros.core.slam.mapping import normal_equations
 from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     apply_global,
@@ -17,6 +17,7 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import (
 )
 from segfloor_ros.core.slam.rig import NO_OFFSET, Rig
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.core.twists import se3_exp, se3_log
 from tools.map_costs import CAMERA, bend, made_up_map, ring
 
 COUNT = 80

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from segfloor_ros.core.geometry import make_transform, se3_exp
+from segfloor_ros.core.geometry import make_transform
 from segfloor_ros.core.slam.places.views import View, is_keyframe, novelty
 from segfloor_ros.core.slam.tracking.front_end import RepeatCheck, image_fault
+from segfloor_ros.core.twists import se3_exp
 
 STILL = np.eye(4)
 MOVED = make_transform(np.eye(3), np.array([0.0, 0.0, 0.2]))

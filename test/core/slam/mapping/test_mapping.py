@@ -7,11 +7,12 @@ import pytest
 from hand_made_maps import CAMERA, SCENES, add, seen
 
 from segfloor_ros.core.contracts import NO_POINT
-from segfloor_ros.core.geometry import make_transform, se3_exp, transform_points
+from segfloor_ros.core.geometry import make_transform, transform_points
 from segfloor_ros.core.slam.mapping.keyframe_mapping import LocalMapper
 from segfloor_ros.core.slam.rig import OffsetEstimate, Rig
 from segfloor_ros.core.slam.sparse_map import SparseMap
 from segfloor_ros.core.slam.tracking.patch_alignment import SIDE_PX
+from segfloor_ros.core.twists import se3_exp
 
 
 @pytest.fixture(params=SCENES)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.core.contracts import RelativeMotion, Up
-from segfloor_ros.core.geometry import invert, make_transform, se3_exp, se3_log
+from segfloor_ros.core.geometry import invert, make_transform
 from segfloor_ros.core.slam.mapping.normal_equations import (
     Levels,
     Links,
@@ -17,6 +17,7 @@ from segfloor_ros.core.slam.mapping.normal_equations import (
     with_factors,
 )
 from segfloor_ros.core.slam.rig import chi2_limit
+from segfloor_ros.core.twists import se3_exp, se3_log
 
 UP = np.array([0.03, -0.99, -0.12]) / np.linalg.norm([0.03, -0.99, -0.12])
 

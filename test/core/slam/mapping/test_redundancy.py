@@ -7,11 +7,11 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.contracts import NO_POINT, StereoFrame
 from segfloor_ros.core.geometry import make_transform
+from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.mapping.keyframe_mapping import redundant_share, retire_redundant
 from segfloor_ros.core.slam.rig import Rig
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import SparseMap
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
 
 
 def views(*point_ids):
@@ -73,7 +73,7 @@ def test_driving_to_and_fro_makes_its_views_once(seed, contrast, turn_rad):
     room = StereoRoom(seed, contrast)
     x = np.concatenate([np.arange(0, 10), np.arange(10, 0, -1)])
     images = {}
-    slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=500), MOUNT)
+    slam = equipped_slam(CAMERA, StereoSlamSettings(num_features=500), MOUNT)
     stamps, views_per_turn = [], []
     for k in range(3 * len(x)):
         at = int(x[k % len(x)])

@@ -9,14 +9,14 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.files.results import from_bytes, to_bytes
 from segfloor_ros.core.geometry import invert
-from segfloor_ros.core.plugins.saved_slam import load_slam, save_slam
+from segfloor_ros.core.plugins.assembly import equipped_slam
+from segfloor_ros.core.plugins.maps.saved_slam import load_slam, save_slam
 from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.places.loops import PlaceMatcher
 from segfloor_ros.core.slam.places.views import GroundViews, motion_between
 from segfloor_ros.core.slam.rig import Rig
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import NOTHING, Match
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
 
 HERE, OPPOSITE = planar_pose(0.0, 0.0, 0.1), planar_pose(1.9, 0.1, 3.0)
 RNG = np.random.default_rng(5)
@@ -65,7 +65,7 @@ def driven_back():
     room = StereoRoom(0)
     room.reset_noise()
     camera = replace(CAMERA, fx=1.01 * CAMERA.fx, fy=1.01 * CAMERA.fy)
-    slam, results = StereoSlam(camera, SETTINGS, MOUNT), []
+    slam, results = equipped_slam(camera, SETTINGS, MOUNT), []
     for k, pose in enumerate(THERE + TURN + BACK):
         results += slam.process(room.frame(k, pose))
     return slam, results
@@ -85,7 +85,7 @@ def test_a_corridor_that_is_driven_back_is_known(driven_back):
 
 def test_a_saved_map_keeps_what_the_floor_ties_together(driven_back):
     slam, _ = driven_back
-    again = StereoSlam(slam.rig.camera, StereoSlamSettings())
+    again = equipped_slam(slam.rig.camera, StereoSlamSettings())
     load_slam(again, slam.rig.camera, save_slam(slam, slam.rig.camera), 'x')
     assert [loop.by_floor for loop in again.map.loops] == [True] * len(slam.map.loops)
 
@@ -112,7 +112,7 @@ def corridor():
 
 
 def driven_there(floor):
-    slam, room = StereoSlam(CAMERA, SETTINGS, MOUNT), StereoRoom(0, floor=floor)
+    slam, room = equipped_slam(CAMERA, SETTINGS, MOUNT), StereoRoom(0, floor=floor)
     for k, pose in enumerate(IN_CORRIDOR):
         slam.process(room.frame(k, pose))
     return slam, from_bytes(to_bytes(save_slam(slam, CAMERA)), 'there.map')
@@ -131,7 +131,7 @@ def there_on_tiles(corridor):
 
 def test_views_of_the_floor_are_saved(there):
     slam, saved = there
-    other = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    other = equipped_slam(CAMERA, SETTINGS, MOUNT)
     load_slam(other, CAMERA, saved, 'there.map')
     for before, after in zip(slam.map.keyframes, other.map.keyframes, strict=True):
         np.testing.assert_array_equal(after.ground.descriptor, before.ground.descriptor)
@@ -140,7 +140,7 @@ def test_views_of_the_floor_are_saved(there):
 
 
 def test_maps_of_earlier_releases_have_no_views_of_the_floor(there):
-    slam, corners = StereoSlam(CAMERA, SETTINGS, MOUNT), ('keyframe_corners', 'corner_')
+    slam, corners = equipped_slam(CAMERA, SETTINGS, MOUNT), ('keyframe_corners', 'corner_')
     arrays = {n: a for n, a in there[1].parts['slam'].items() if not n.startswith(corners)}
     load_slam(slam, CAMERA, replace(there[1], parts={'slam': arrays}), 'x')
     assert all(k.ground is NOTHING for k in slam.map.keyframes)
@@ -155,7 +155,7 @@ def test_maps_of_earlier_releases_have_no_views_of_the_floor(there):
 def test_a_session_that_starts_the_other_way_is_recognised_by_the_floor(
     request, name, floor, seed, is_known
 ):
-    slam, results = StereoSlam(CAMERA, SETTINGS, MOUNT), []
+    slam, results = equipped_slam(CAMERA, SETTINGS, MOUNT), []
     load_slam(slam, CAMERA, request.getfixturevalue(name)[1], 'there.map')
     room = StereoRoom(seed, floor=floor)
     for k, pose in enumerate(TO_IT):
@@ -178,7 +178,7 @@ def test_a_keyframe_that_looks_like_another_place_than_its_floor_does_counts_for
 
     monkeypatch.setattr(PlaceMatcher, 'look', looks_like_the_start)
     monkeypatch.setattr(PlaceMatcher, 'objection', lambda *_: '')
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     load_slam(slam, CAMERA, there[1], 'there.map')
     room = StereoRoom(0, floor=FLOOR)
     for k, pose in enumerate(TO_IT):

@@ -7,7 +7,7 @@ import pytest
 from hand_made_maps import CAMERA, SCENES, add, keyframe, row_of_views, seen
 
 from segfloor_ros.core.contracts import NO_POINT, Mount
-from segfloor_ros.core.geometry import make_transform, se3_exp
+from segfloor_ros.core.geometry import make_transform
 from segfloor_ros.core.slam.places.loops import (
     DRIFT_PER_M,
     FREE_DRIFT,
@@ -18,6 +18,7 @@ from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.core.slam.rig import Observations, Rig
 from segfloor_ros.core.slam.sparse_map import Match, SparseMap
 from segfloor_ros.core.slam.thresholds import PROOF
+from segfloor_ros.core.twists import se3_exp
 
 MOUNT = Mount(0.4, 0.15)
 POINTS = SCENES['wall']

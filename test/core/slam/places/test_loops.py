@@ -9,8 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.core.geometry import invert, make_transform, se3_exp
-from segfloor_ros.core.plugins.saved_slam import fill_map, map_to_arrays, moved
+from segfloor_ros.core.geometry import invert, make_transform
+from segfloor_ros.core.plugins.assembly import equipped_slam
+from segfloor_ros.core.plugins.maps.known_map import SubmapKeeper
+from segfloor_ros.core.plugins.maps.map_arrays import fill_map, map_to_arrays, moved
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.slam.mapping import back_end
 from segfloor_ros.core.slam.mapping.bundle_adjustment import move_keyframes
@@ -19,9 +21,9 @@ from segfloor_ros.core.slam.places.loops import PlaceMatcher, objection_to_drift
 from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import LoopEdge, Match, SparseMap
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.thresholds import PROOF
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
+from segfloor_ros.core.twists import se3_exp
 
 SETTINGS = StereoSlamSettings(num_features=600)
 TURN = 52
@@ -48,7 +50,7 @@ def bend(slam, drift):
 
 def drive(drift):
     """Returns the SLAM and the error in metres of each frame after a turn with a drift."""
-    room, slam, errors = StereoRoom(), StereoSlam(CAMERA, SETTINGS, MOUNT), []
+    room, slam, errors = StereoRoom(), equipped_slam(CAMERA, SETTINGS, MOUNT), []
     poses = on_the_spot(TURN + 14)
     for k, pose in enumerate(poses):
         if k == BENT_AT:
@@ -222,7 +224,7 @@ def closing_loops(closed, monkeypatch, background):
     sparse_map, none = SparseMap(closed[0].rig), np.zeros(0, np.int32)
     fill_map(sparse_map, map_to_arrays(closed[0].map))
     front_end = FrontEnd(SETTINGS, sparse_map, BodyMotion())
-    mapping = back_end.BackEnd(SETTINGS, sparse_map, front_end, background)
+    mapping = back_end.BackEnd(SETTINGS, sparse_map, front_end, background, SubmapKeeper())
     last = sparse_map.keyframes[-1]
 
     def close(off_m):

@@ -7,7 +7,7 @@ from scipy import sparse
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.contracts import NO_POINT
-from segfloor_ros.core.geometry import se3_exp
+from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.places.views import (
     SECOND_VISIT,
     covered_share,
@@ -17,7 +17,7 @@ from segfloor_ros.core.slam.places.views import (
 )
 from segfloor_ros.core.slam.rig import NEIGHBOURS
 from segfloor_ros.core.slam.settings import StereoSlamSettings
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
+from segfloor_ros.core.twists import se3_exp
 
 HERE = np.eye(4)
 
@@ -165,7 +165,7 @@ def sparse_map_without(sparse_map, views):
 
 def test_laps_of_a_room_add_no_points_after_the_second():
     room = StereoRoom()
-    slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=500), MOUNT)
+    slam = equipped_slam(CAMERA, StereoSlamSettings(num_features=500), MOUNT)
     rng = np.random.default_rng(2)
     per_lap, size, error_m = 20, [], []
     for k in range(3 * per_lap):

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.core.geometry import invert, make_transform, se3_exp, se3_log, se3_logs
+from segfloor_ros.core.geometry import invert, make_transform
 from segfloor_ros.core.slam.places.loop_closing import PoseGraph, optimise
+from segfloor_ros.core.twists import se3_exp, se3_log, se3_logs
 
 COUNT = 60
 

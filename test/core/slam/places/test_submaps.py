@@ -7,9 +7,9 @@ import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.settings import StereoSlamSettings
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=600)
 ROOM = StereoRoom()
@@ -34,7 +34,7 @@ def errors(results, poses):
 
 @pytest.fixture(scope='module')
 def merged():
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     return slam, drive(slam, KNOWN + BEHIND + TURN + ON), KNOWN + BEHIND + TURN + ON
 
 
@@ -90,7 +90,7 @@ def test_the_odometry_goes_on_where_the_camera_got_lost(merged):
 )
 def test_a_submap_is_merged_only_where_the_robot_can_have_driven(waited_s, is_there):
     """What it sees 1.6 s after it got lost looks like a place 4 m away."""
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     way = [planar_pose(-2.0 + 0.1 * k, 0.0, 0.0) for k in range(41)]
     lost = 2 * len(way)
     found = lost + 15 + 10 * waited_s
@@ -105,7 +105,7 @@ def test_a_submap_is_merged_only_where_the_robot_can_have_driven(waited_s, is_th
 
 
 def test_a_submap_that_is_never_recognised_is_not_in_the_map():
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     drive(slam, KNOWN)
     before = slam.to_arrays()
     batches = drive(slam, KNOWN, len(KNOWN), StereoRoom(seed=77))
@@ -122,7 +122,7 @@ def test_a_submap_that_is_never_recognised_is_not_in_the_map():
 
 
 def test_of_two_that_were_not_joined_the_larger_is_the_map():
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     way = [planar_pose(0.03 * k, 0.0, 0.03 * k) for k in range(60)]
     poses = KNOWN + way
     drive(slam, KNOWN)
@@ -142,7 +142,7 @@ def test_of_two_that_were_not_joined_the_larger_is_the_map():
 
 
 def test_a_map_that_had_hardly_begun_is_given_up():
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     first, poses = len(KNOWN[:5]), KNOWN[:5] + BEHIND + TURN
     batches = drive(slam, poses)
     assert [len(batch) for batch in batches] == [1] * len(poses)
@@ -162,7 +162,7 @@ def test_a_map_that_had_hardly_begun_is_given_up():
 
 
 def test_a_camera_that_is_lost_again_is_looked_for_in_the_map():
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     drive(slam, KNOWN)
     drive(slam, KNOWN, 20, StereoRoom(seed=77))
     batches = drive(slam, [KNOWN[10]] * 20, 40)

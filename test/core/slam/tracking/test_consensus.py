@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.core.geometry import Array, invert, se3_exp, se3_log, transform_points
+from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.rig import Observations, Rig
 from segfloor_ros.core.slam.tracking.pose import Consensus, refine_pose
+from segfloor_ros.core.twists import se3_exp, se3_log
 
 STILL, MOVING = 60, 140
 TRUTH = se3_exp(np.array([0.02, -0.01, 0.05, 0.004, 0.02, -0.006]))

@@ -7,8 +7,8 @@ import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.settings import StereoSlamSettings
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.tracking.images import Images, follow_pixels, shrink
 from segfloor_ros.core.slam.tracking.map_tracking import TRACKED_POINTS
 
@@ -38,7 +38,7 @@ def test_flow_of_a_turn_is_that_of_the_pinhole_camera(width, room):
 
 
 def test_follows_a_frame_to_the_millimetre_or_not_at_all(room):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     slam.process(room.frame(0, planar_pose(0, 0, 0)))
     frame = room.frame(1, planar_pose(0.03, 0, 0.02))
     other = StereoRoom(seed=5).frame(1, planar_pose(0.03, 0, 0.02))
@@ -57,7 +57,7 @@ def test_follows_a_frame_to_the_millimetre_or_not_at_all(room):
 
 
 def test_points_that_are_gone_are_not_followed(room):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     slam.process(room.frame(0, planar_pose(0, 0, 0)))
     follower, ids = slam.front_end.follower, slam.front_end.follower.seen_ids
     slam.map.remove_points(ids[::2])
@@ -69,7 +69,7 @@ def test_points_that_are_gone_are_not_followed(room):
 
 
 def test_only_keyframes_need_features(monkeypatch, room):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     extract = slam.front_end.extractor.extract
     calls = []
     monkeypatch.setattr(

@@ -4,9 +4,10 @@ import numpy as np
 from stereo_room import MOUNT, planar_pose
 
 from segfloor_ros.core.contracts import ImuSample, WheelPose
-from segfloor_ros.core.geometry import invert, se3_exp
+from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.slam.tracking.motion import CameraMotion, sigma_m
+from segfloor_ros.core.twists import se3_exp
 
 SOMEWHERE = se3_exp(np.array([0.7, -0.4, 1.5, 0.3, -0.9, 0.2]))
 """A camera that is neither at the origin nor level."""

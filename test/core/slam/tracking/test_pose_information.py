@@ -9,9 +9,9 @@ import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.contracts import WheelPose
+from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.settings import StereoSlamSettings
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 from segfloor_ros.core.slam.tracking.patch_alignment import with_patch_noise
 from segfloor_ros.core.slam.tracking.pose import (
@@ -127,7 +127,7 @@ def test_pixels_are_as_sure_with_wheels_as_without_where_the_images_know_more():
     frames = [room.frame(k, planar_pose(0.04 * k, 0, 0)) for k in range(8)]
 
     def median_sigma_px(measured):
-        slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
+        slam = equipped_slam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
         for pose in measured:
             slam.add(pose)
         for frame in frames:
@@ -157,7 +157,7 @@ def test_a_prior_leaves_the_noise_of_the_images_as_it_is(monkeypatch):
         return weighed[-1]
 
     monkeypatch.setattr(FrontEnd, '_weighed', weigh_blurred)
-    room, slam = StereoRoom(), StereoSlam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
+    room, slam = StereoRoom(), equipped_slam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
     frames = [room.frame(k, planar_pose(0.04 * k, 0, 0)) for k in range(4)]
     for k in range(10):
         slam.add(WheelPose(k * frames[1].stamp_ns // 2, planar_pose(0.02 * k, 0, 0)))
@@ -177,7 +177,7 @@ def test_a_pixel_on_an_edge_is_sure_across_it_alone():
 
 def test_a_pose_that_the_images_hardly_determine_is_said_to_be_uncertain(monkeypatch):
     room = StereoRoom()
-    slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
+    slam = equipped_slam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
     frames = [room.frame(k, planar_pose(0.04 * k, 0, 0)) for k in range(4)]
     seen = [result.state for frame in frames[:2] for result in slam.process(frame)]
     monkeypatch.setattr('segfloor_ros.core.slam.tracking.front_end.PLENTY', 10_000)

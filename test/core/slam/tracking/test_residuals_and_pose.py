@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.geometry import invert, se3_exp, se3_log, transform_points
+from segfloor_ros.core.geometry import invert, transform_points
 from segfloor_ros.core.slam.rig import (
     Observations,
     huber_cost,
@@ -14,6 +14,7 @@ from segfloor_ros.core.slam.rig import (
     with_moment,
 )
 from segfloor_ros.core.slam.tracking.pose import refine_pose, solve_pnp
+from segfloor_ros.core.twists import se3_exp, se3_log
 
 CAMERA = StereoCamera(640, 480, 320.0, 310.0, 319.5, 239.5, 0.12)
 

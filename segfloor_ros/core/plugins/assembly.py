@@ -1,0 +1,104 @@
+"""SLAM and the pipeline with everything plugged in."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.contracts import Mount
+from segfloor_ros.core.floor.plane.mount import MountEstimator
+from segfloor_ros.core.pipeline import KeyframeListener, KeyframeStages, Pipeline
+from segfloor_ros.core.plugins.maps.known_map import SubmapKeeper
+from segfloor_ros.core.plugins.moving.moving_regions import MovingRegions
+from segfloor_ros.core.plugins.rig.check import RigCheck
+from segfloor_ros.core.plugins.semantics.network import ImageLabeller
+from segfloor_ros.core.plugins.semantics.semantic_map import SemanticMap
+from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
+from segfloor_ros.core.slam.optional import MountMeter, NothingMoves, Plugins
+from segfloor_ros.core.slam.settings import StereoSlamSettings
+from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE, StereoSlam
+from segfloor_ros.core.timing import StageTimes
+
+
+def make_slam(
+    camera: StereoCamera,
+    settings: StereoSlamSettings,
+    mount: Mount | None = None,
+    times: StageTimes | None = None,
+    background: bool = False,
+) -> StereoSlam:
+    """Build stereo SLAM with the camera's mount: `mount` when it is known (from tf), else from
+    the settings, and whatever the settings leave open is measured from the floor the camera
+    sees. background: adjust the map beside tracking.
+    """
+    height_m, pitch_rad, roll_rad = (
+        settings.camera_height_m,
+        settings.camera_pitch_rad,
+        settings.camera_roll_rad,
+    )
+    if mount is None and settings.has_mount:
+        mount = Mount(
+            height_m, pitch_rad, roll_rad, settings.camera_forward_m, settings.camera_left_m
+        )
+    meter = None
+    if mount is None:
+        meter = MountEstimator(
+            camera,
+            height_m,
+            pitch_rad,
+            roll_rad,
+            forward_m=settings.camera_forward_m,
+            left_m=settings.camera_left_m,
+        )
+    elif mount is not CAMERA_AS_BASE:
+        meter = MountEstimator(camera, forward_m=mount.forward_m, left_m=mount.left_m, given=mount)
+    return equipped_slam(camera, settings, mount, meter, times, background)
+
+
+def equipped_slam(
+    camera: StereoCamera,
+    settings: StereoSlamSettings,
+    mount: Mount | None = None,
+    meter: MountMeter | None = None,
+    times: StageTimes | None = None,
+    background: bool = False,
+) -> StereoSlam:
+    """Build stereo SLAM with all that it can do without, and a given meter of the mount."""
+    plugins = Plugins(
+        MovingRegions(camera) if settings.detect_moving else NothingMoves(),
+        BodyMotion(),
+        RigCheck(camera),
+        SubmapKeeper(),
+    )
+    return StereoSlam(camera, settings, mount, meter, times, background, plugins)
+
+
+def make_stages(
+    camera: StereoCamera,
+    configuration: Configuration,
+    times: StageTimes,
+    labeller: ImageLabeller | None = None,
+) -> KeyframeStages:
+    """Build the stages behind SLAM. labeller: of their keyframes, where there is a network."""
+    height_m = configuration.floor_segmentation.robot_height_m
+    semantics = SemanticMap(camera, labeller, height_m)
+    return KeyframeStages(camera, configuration, times, semantics)
+
+
+def make_pipeline(
+    camera: StereoCamera,
+    configuration: Configuration,
+    on_keyframe: KeyframeListener | None = None,
+    path_only: bool = False,
+    labeller: ImageLabeller | None = None,
+    times: StageTimes | None = None,
+) -> Pipeline:
+    """Build the whole pipeline. path_only: SLAM runs alone, also where no floor shows the mount;
+    the camera is then taken for the base. labeller: of the frames, where there is a network.
+    """
+    times = times or StageTimes()
+    mount = CAMERA_AS_BASE if path_only and not configuration.stereo_slam.has_mount else None
+    slam = make_slam(camera, configuration.stereo_slam, mount, times)
+    stages = partial(make_stages, camera, configuration, times, labeller)
+    return Pipeline(slam, stages, times, on_keyframe, path_only)

@@ -1,0 +1,209 @@
+"""A known map beside the drive's own: one that was loaded, or that the drive made before it got
+lost.
+
+Once several keyframes in a row see it and agree on where it lies, the drive's own map is brought
+into it (Campos et al., ORB-SLAM3, IEEE T-RO 2021, section VI: map merging). Two saved maps, of
+several robots or of days that were mapped apart, become one in the same way: the keyframes of the
+second are looked for in the first by what they observed, one after the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import NO_POINT
+from segfloor_ros.core.files.arrays import Arrays
+from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.plugins.maps.map_arrays import fill_map, map_to_arrays, moved
+from segfloor_ros.core.slam.mapping.bundle_adjustment import apply_global, copy_map, solve_global
+from segfloor_ros.core.slam.places.loop_closing import (
+    apply_closing,
+    fuse_latest,
+    loop_edge,
+    merge_pairs,
+    plan_closing,
+    solve_closing,
+)
+from segfloor_ros.core.slam.places.loops import LoopDetector, PlaceMatcher, drift
+from segfloor_ros.core.slam.places.place_recognition import (
+    FloorIndex,
+    PlaceRecognition,
+    Relocaliser,
+)
+from segfloor_ros.core.slam.rig import OffsetEstimate, Rig
+from segfloor_ros.core.slam.sparse_map import KeyframeRecord, Match, SparseMap
+from segfloor_ros.core.slam.thresholds import PROOF
+from segfloor_ros.core.slam.tracking.images import Features
+from segfloor_ros.core.slam.tracking.map_tracking import Pixels
+from segfloor_ros.core.slam.tracking.track import Track
+
+TIMES_SURE = 2
+"""Where nothing limits where a place can be, so many times the evidence of a loop is asked for:
+walls with the same paper, and shelves that stand twice in a building, are taken for one now and
+then."""
+
+OFFSET = 'disparity_offset'
+"""What a map knows of the disparity offset, by name."""
+
+
+class KnownMap:
+    """The known map, beside the drive's own. of_drive: whether this drive made it, and got lost."""
+
+    def __init__(self, own: SparseMap, arrays: Arrays, of_drive: bool) -> None:
+        self._own = own
+        self.of_drive = of_drive
+        self._map = SparseMap(own.rig)
+        fill_map(self._map, arrays)
+        self._places = PlaceRecognition(self._map)
+        self._places.from_arrays(arrays)
+        self._relocaliser = Relocaliser(self._map, self._places)
+        self._matcher = PlaceMatcher(own, self._map, self._places, TIMES_SURE * PROOF)
+        self._floors = FloorIndex(self._map.keyframes)
+
+    @property
+    def num_keyframes(self) -> int:
+        """How large the known map is."""
+        return len(self._map.keyframes)
+
+    def recognise(self, keyframe: KeyframeRecord, images: Pixels) -> bool:
+        """Whether enough keyframes in a row see the known map, this one the last of them. One whose
+        floor is seen elsewhere than its look says nothing: shelves and pictures are all over a
+        building, and so are floors.
+        """
+        anywhere = np.ones(len(self._map.keyframes), bool)
+        by_look = self._matcher.look(keyframe, images, anywhere, ~anywhere)
+        by_floor = self._matcher.look_at_floor(keyframe, self._floors.like(keyframe.ground))
+        match = by_look or by_floor
+        is_possible = match is not None and self._is_possible(keyframe, match)
+        if by_look and by_floor and not self._matcher.agree(by_look, by_floor):
+            is_possible = False
+        return self._matcher.add(match if is_possible else None)
+
+    def _is_possible(self, keyframe: KeyframeRecord, match: Match) -> bool:
+        if self.of_drive and not self._matcher.is_within_reach(match):
+            return False
+        return not self._matcher.objection(keyframe, match)
+
+    def find(
+        self, images: Pixels, features: Features, stamp_ns: int
+    ) -> tuple[Track | None, dict[int, Track]]:
+        """Return a frame with its pose in the known map, once several in a row were found there,
+        and those, by stamp.
+        """
+        found = self._relocaliser.find(images, features, stamp_ns)
+        return found, self._relocaliser.take_proof()
+
+    def _own_ids(self, match: Match) -> NDArray[np.int32]:
+        """Return the stable ids (N,) that the points of a match have in the drive's own map, -1
+        where it has none.
+        """
+        keyframe = self._own.keyframes[match.keyframe]
+        own = np.full(len(match.rows), NO_POINT, np.int32)
+        if not keyframe.is_thin:
+            own = keyframe.point_id[match.rows]
+        return np.where(own != NO_POINT, self._own.stable_id[own], np.int32(NO_POINT))
+
+    def merge(self, own_words: Arrays) -> Arrays:
+        """Merge the drive's own map into the known one, with the same ids and stamps. Returns the
+        words of all keyframes.
+        """
+        matches = self._matcher.matches
+        latest, own_ids = matches[-1], [self._own_ids(match) for match in matches]
+        T_known_own = invert(drift(self._own, latest))
+        before = len(self._map.keyframes)
+        arrays = moved(map_to_arrays(self._own), T_known_own)
+        known = self.to_arrays()
+        self.restore(known)
+        fill_map(self._own, arrays)
+        for match, ids in zip(matches, own_ids, strict=True):
+            edge = loop_edge(self._own, match)
+            self._own.loops.append(replace(edge, i=before + match.keyframe))
+            merge_pairs(self._own, self._rows(ids), self._rows(match.stable_ids))
+        fuse_latest(self._own, before + latest.keyframe)
+        return {name: np.concatenate([known[name], own_words[name]]) for name in own_words}
+
+    def to_arrays(self) -> Arrays:
+        """Return the known map and the words of its keyframes."""
+        return map_to_arrays(self._map) | self._places.to_arrays()
+
+    def restore(self, known: Arrays) -> None:
+        """Put the known map, as `to_arrays` returns it, in the place of the drive's own."""
+        self._own.reset()
+        fill_map(self._own, known)
+
+    def _rows(self, stable_ids: NDArray[np.int32]) -> NDArray[np.intp]:
+        """Return the rows (N,) of points in the merged map, -1 for those that are gone."""
+        rows = np.searchsorted(self._own.stable_id, stable_ids)
+        rows = np.minimum(rows, len(self._own.stable_id) - 1)
+        there = (self._own.stable_id[rows] == stable_ids) & self._own.alive[rows]
+        return np.where(there, rows, -1)
+
+
+def merge_slam(first: Arrays, second: Arrays, rig: Rig) -> Arrays | None:
+    """Return two maps as one; None where no place of the first is seen in the second. rig: of the
+    first, and of the second as the rig of the first would have measured it (`as_seen_by`), with ids
+    and stamps that come after those of the first.
+    """
+    rig.offset.estimate = OffsetEstimate(*first[OFFSET].tolist())
+    merged = SparseMap(rig)
+    fill_map(merged, second)
+    known = KnownMap(merged, first, of_drive=False)
+    alive = [keyframe for keyframe in merged.keyframes if keyframe.retired is None]
+    if not any(known.recognise(keyframe, keyframe.observations.exact()) for keyframe in alive):
+        return None
+    words = known.merge({name: second[name] for name in ('words', 'word_count')})
+    places = PlaceRecognition(merged)
+    places.from_arrays(words)
+    _close_loops(merged, places, len(first['keyframe_stamp_ns']))
+    return map_to_arrays(merged) | places.to_arrays() | {OFFSET: first[OFFSET]}
+
+
+def _close_loops(merged: SparseMap, places: PlaceRecognition, begin: int) -> None:
+    """Close the loops that keyframes from index `begin` on see, and adjust the whole map."""
+    loops = LoopDetector(merged, places)
+    for keyframe in merged.keyframes[begin:]:
+        if keyframe.retired is not None:
+            continue
+        matches = loops.detect(keyframe, keyframe.observations.exact())
+        if matches:
+            closing = plan_closing(merged, matches)
+            apply_closing(merged, closing, solve_closing(closing))
+    copied = copy_map(merged, merged.rig.offset.estimate, None)
+    apply_global(merged, solve_global(merged.rig.camera, copied, lambda: True))
+
+
+def as_seen_by(camera: StereoCamera, offset_px: float, own: StereoCamera, arrays: Arrays) -> Arrays:
+    """Return a map, made with camera `own`, as another rectified one would have measured it, whose
+    disparities have an offset.
+    """
+    zoom = np.array([camera.fx / own.fx, camera.fy / own.fy, 1.0])
+    zoom[2] = camera.disparity_times_depth / own.disparity_times_depth
+    before = np.array([own.cx, own.cy, float(arrays[OFFSET][0])])
+    now = np.array([camera.cx, camera.cy, offset_px])
+    uvd_px = (arrays['feature_uvd_px'].astype(np.float64) - before) * zoom + now
+    return arrays | {
+        'feature_uvd_px': uvd_px.astype(np.float32),
+        'feature_sigma_px': (arrays['feature_sigma_px'] * zoom).astype(np.float16),
+    }
+
+
+class SubmapKeeper:
+    """Lets SLAM save its map, go on with one, and map a submap beside one it was lost in."""
+
+    can_hold = True
+
+    def to_arrays(self, sparse_map: SparseMap) -> Arrays:
+        """Return a map as arrays."""
+        return map_to_arrays(sparse_map)
+
+    def fill(self, sparse_map: SparseMap, arrays: Arrays) -> None:
+        """Add a map to an empty one. Raises KeyError or ValueError for arrays that are no map."""
+        fill_map(sparse_map, arrays)
+
+    def hold(self, own: SparseMap, places: PlaceRecognition, of_drive: bool) -> KnownMap:
+        """Return the present map as a known one, beside which `own` may begin anew."""
+        return KnownMap(own, map_to_arrays(own) | places.to_arrays(), of_drive)
