@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -13,7 +14,15 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.images import read_picture
-from segfloor_ros.core.files.writing import MARK, PGM, YAML, check_output, write_output
+from segfloor_ros.core.files.writing import (
+    HASH_BYTES,
+    MARK,
+    YAML,
+    Kind,
+    check_output,
+    hash_of,
+    write_output,
+)
 from segfloor_ros.core.grid.occupancy import (
     FREE,
     FREE_THRESH,
@@ -48,8 +57,10 @@ def save_map(
         **(facts or {}),
     }
     pixels = grid.cells[::-1].view(np.uint8) if mode == 'raw' else grid.picture
-    text = f'# {MARK}\n{yaml.safe_dump(description, sort_keys=False)}'
-    write_output(image_path, PGM, _pgm_bytes(pixels))
+    image = _pgm_bytes(pixels)
+    digest = hashlib.blake2b(image, digest_size=HASH_BYTES).hexdigest()
+    text = f'# {MARK}, with an image {digest}\n{yaml.safe_dump(description, sort_keys=False)}'
+    write_output(image_path, _image_of(path), image)
     write_output(path, YAML, text.encode())
 
 
@@ -59,7 +70,17 @@ def check_map_output(path: Path, inputs: Iterable[Path | str | None] = ()) -> No
     if path.suffix == '.pgm':
         raise InputError(f'{path}: is a name for the image; name the YAML file')
     check_output(path, YAML, inputs)
-    check_output(path.with_suffix('.pgm'), PGM, inputs)
+    check_output(path.with_suffix('.pgm'), _image_of(path), inputs)
+
+
+def _image_of(path: Path) -> Kind:
+    """Return the kind of the image that belongs to a map of segfloor and is unchanged since."""
+
+    def is_own(image: Path) -> bool:
+        has_map = path.is_file() and YAML.is_own(path)
+        return has_map and hash_of(image) in path.read_text(errors='replace').partition('\n')[0]
+
+    return Kind('image of a map', is_own)
 
 
 def load_map(path: Path) -> OccupancyGrid:
@@ -77,7 +98,7 @@ def load_map(path: Path) -> OccupancyGrid:
 
 def _pgm_bytes(pixels: NDArray[np.uint8]) -> bytes:
     rows, columns = pixels.shape
-    return f'P5\n# {MARK}\n{columns} {rows}\n255\n'.encode() + pixels.tobytes()
+    return f'P5\n{columns} {rows}\n255\n'.encode() + pixels.tobytes()
 
 
 def _read_description(path: Path) -> dict[str, Any]:

@@ -34,6 +34,8 @@ TEMPORARY = '.segfloor-'
 """Names of temporary files and folders begin with this."""
 
 MARK = 'written by segfloor'
+HASH_BYTES = 16
+
 HEAD_BYTES = 4096
 """The mark of a file is in its first or last so many bytes."""
 
@@ -59,7 +61,6 @@ def marked(name: str, prefix: bytes, mark: bytes = MARK.encode()) -> Kind:
 
 
 PNG = marked('PNG', b'\x89PNG\r\n\x1a\n')
-PGM = marked('PGM', b'P5\n# ' + MARK.encode())
 YAML = marked('YAML file', b'# ' + MARK.encode())
 PAGE = marked('page', b'<!DOCTYPE html>\n<!-- ' + MARK.encode())
 VIEW = marked('view', b'RRF', b'segfloor')
@@ -97,7 +98,7 @@ def _check_replaceable(
     if not os.path.lexists(path):
         return
     if not _is_plain(path):
-        raise InputError(f'{what}: is not a plain file (a link, folder, device or pipe)')
+        raise InputError(f'{what}: cannot be written (is a link, folder, device or pipe)')
     for one in inputs:
         if one and os.path.exists(one) and path.samefile(one):
             raise InputError(f'{what}: is the input {one}; choose another name')
@@ -160,7 +161,7 @@ def check_target(
     segfloor for these very names; neither is, holds nor lies in an input; and holds nothing of
     others by one of the names.
     """
-    _check_folder(target)
+    _check_kind(target)
     place = target.resolve()
     for one in inputs:
         if one and os.path.exists(one):
@@ -169,6 +170,7 @@ def check_target(
                 raise InputError(
                     f'{target}: is, holds or lies in {one}, which is read; choose another --out'
                 )
+    _check_folder(target)
     own, names = {PurePosixPath(name).parts[0] for name in own_files(target)}, set(names)
     if own - names:
         raise InputError(
@@ -177,10 +179,17 @@ def check_target(
     _refuse(target, [n for n in sorted(names - own) if os.path.lexists(target / n)])
 
 
-def _check_folder(target: Path) -> None:
+def _check_kind(target: Path) -> None:
     with os_errors(f'{target}: cannot be written', '; choose another --out'):
-        if target.is_symlink() or (os.path.lexists(target) and not target.is_dir()):
-            raise InputError(f'{target}: is a link or no folder; choose another --out')
+        if target.is_symlink():
+            raise InputError(f'{target}: is a link; choose another --out')
+        if os.path.lexists(target) and not target.is_dir():
+            raise InputError(f'{target}: exists and is no folder; choose another --out')
+
+
+def _check_folder(target: Path) -> None:
+    _check_kind(target)
+    with os_errors(f'{target}: cannot be written', '; choose another --out'):
         if not target.exists() or _is_plain(target / MARKER):
             return
         if any(not name.startswith(TEMPORARY) for name in os.listdir(target)):
@@ -248,7 +257,7 @@ def add_files(folder: Path, files: Mapping[str, bytes]) -> None:
 
 def _replace_files(target: Path, new: Mapping[str, Path], is_all: bool) -> None:
     """Move files to a folder by their names in it. is_all: it has no others of segfloor then."""
-    hashes = {name: _hash_of(path) for name, path in new.items()}
+    hashes = {name: hash_of(path) for name, path in new.items()}
     with _locked(target):
         _check_folder(target)
         old = own_files(target)
@@ -288,14 +297,14 @@ def own_files(folder: Path) -> dict[str, str]:
                 digest, _, name = line.partition('  ')
                 listed.setdefault(name, set()).add(digest)
     there = [n for n in _files_in(folder) if n in listed and _is_plain(folder / n)]
-    hashes = {name: _hash_of(folder / name) for name in there}
+    hashes = {name: hash_of(folder / name) for name in there}
     return {name: digest for name, digest in hashes.items() if digest in listed[name]}
 
 
-def _hash_of(path: Path) -> str:
+def hash_of(path: Path) -> str:
     """Return a hash of what a file holds, '' for one that cannot be read."""
     with suppress(OSError), path.open('rb') as file:
-        digest = hashlib.blake2b(digest_size=16)
+        digest = hashlib.blake2b(digest_size=HASH_BYTES)
         while block := file.read(1 << 20):
             digest.update(block)
         return digest.hexdigest()

@@ -104,7 +104,7 @@ TO_FILES = {
     'map export': 'map export {made}/home.map {}',
     'map filter': 'map filter {made}/labels.yaml {} --keepout grass',
     'evaluate map --overlay': 'evaluate map {made}/result {made}/result --overlay {}',
-    'evaluate trajectory --plot': 'evaluate trajectory {made}/result {made}/result --plot {}',
+    'evaluate trajectory --plot': 'evaluate trajectory {made}/result/trajectory.txt {made}/result/trajectory.txt --plot {}',
     'check --write-baseline': 'check {made}/suite.yaml --out {new} --write-baseline {}',
     'view --out': 'view {made}/result --out {}',
 }
@@ -199,7 +199,7 @@ def test_what_segfloor_wrote_is_replaced_and_what_was_changed_since_is_not(made,
         (['map', 'export', saved], 'map.yaml'),
         (['map', 'diff', saved, made / 'home.map'], 'changes.png'),
         (['evaluate', 'map', out, out, '--overlay'], 'overlay.png'),
-        (['evaluate', 'trajectory', out, out, '--plot'], 'plot.svg'),
+        (['evaluate', 'trajectory', *2 * [out / 'trajectory.txt'], '--plot'], 'plot.svg'),
         (['view', made / 'result', '--out'], 'view.rrd'),
     ):
         for _ in range(2):
