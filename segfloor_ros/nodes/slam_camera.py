@@ -29,7 +29,6 @@ from segfloor_ros.core.camera.images import (
 )
 from segfloor_ros.core.contracts import InputFault, Mount
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.geometry import MAX_DISORDER_NS
 from segfloor_ros.nodes.configuration import StereoSlamNodeSettings
 from segfloor_ros.nodes.messages.arrays import same_calibration
 from segfloor_ros.nodes.messages.diagnostics import LASTS_S, RECENT, Level
@@ -40,12 +39,6 @@ from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 
 CATCH_UP = 0.2
 """Of so many of the pairs kept one is skipped per pair processed, where there is no other way."""
-
-AGREEING_PAIRS = 3
-"""So many pairs in a row must agree that the clock has jumped: two wrong stamps are rare."""
-
-MAX_STEP_NS = 2_000_000_000
-"""From one pair to the next, unless the camera is slower."""
 
 INFOS = ('left/camera_info', 'right/camera_info')
 
@@ -86,45 +79,6 @@ class PairQueue(deque[StampedPair]):
     def reset(self) -> None:
         """Keep many pairs again, as at the start."""
         self._allowed = KEYFRAMES.depth
-
-
-class StampOrder:
-    """Tells a wrong stamp from a clock that jumped: a jump counts when several pairs in a row agree
-    on the new time. last_ns: the last stamp that was taken.
-    """
-
-    def __init__(self, last_ns: int | None = None) -> None:
-        self.last_ns = last_ns
-        self._usual_step_ns = MAX_STEP_NS
-        self._elsewhere: list[int] = []
-
-    def take(self, stamp_ns: int) -> str:
-        """Take the stamp of a pair; returns '' where the pair is to be processed, else why not. It
-        may be before the last one then, by more than `MAX_DISORDER_NS`: time has jumped back.
-        """
-        last_ns = self.last_ns
-        step_ns = self._usual_step_ns if last_ns is None else stamp_ns - last_ns
-        if 0 < step_ns <= self._usual_step_ns:
-            self._elsewhere.clear()
-        elif -MAX_DISORDER_NS <= step_ns <= 0:
-            return 'older than the pair before it; dropped'
-        elif not self._agree_on(stamp_ns):
-            return f'its stamp jumps by {1e-9 * step_ns:.3f} s; dropped'
-        self.last_ns = stamp_ns
-        return ''
-
-    def _agree_on(self, stamp_ns: int) -> bool:
-        """Whether the last pairs agree on another time."""
-        if self._elsewhere and stamp_ns <= self._elsewhere[-1]:
-            self._elsewhere.clear()
-        self._elsewhere.append(stamp_ns)
-        if len(self._elsewhere) < AGREEING_PAIRS:
-            return False
-        steps_ns = np.diff(self._elsewhere)
-        self._elsewhere.clear()
-        # Of a slow camera every step is long.
-        self._usual_step_ns = max(MAX_STEP_NS, 2 * int(steps_ns.max()))
-        return True
 
 
 @dataclass(frozen=True)

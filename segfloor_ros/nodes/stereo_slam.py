@@ -19,10 +19,11 @@ from segfloor_ros.nodes.configuration import StereoSlamNodeSettings
 from segfloor_ros.nodes.messages.diagnostics import Level
 from segfloor_ros.nodes.messages.topics import FRAME_DONE, make_header
 from segfloor_ros.nodes.shared.inputs import CHECK_S
+from segfloor_ros.nodes.shared.joining import InTime, StampOrder
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
-from segfloor_ros.nodes.slam_camera import Pair, StampOrder, StereoInput
+from segfloor_ros.nodes.slam_camera import Pair, StereoInput
 from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamMaps, SlamResults
 from segfloor_ros.nodes.slam_sensors import InitialPose, MaskInput, SensorInput
 
@@ -161,15 +162,19 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         """Whether a pair comes after the one before; where time has jumped back, e.g. because a
         recording is played again, the map is reset.
         """
-        last_ns = self._stamps.last_ns
-        why_not = self._stamps.take(stamp_ns)
-        if why_not:
+        stamps, last_ns = self._stamps, self._stamps.last_ns
+        found = stamps.take(stamp_ns)
+        step_s = 0.0 if last_ns is None else 1e-9 * (stamp_ns - last_ns)
+        if found in (InTime.LATE, InTime.ELSEWHERE):
+            words = {
+                InTime.LATE: 'older than the pair before it; dropped',
+                InTime.ELSEWHERE: f'its stamp is {step_s:.3f} s from the one before; dropped',
+            }
             self.reporter.health.count('stamps out of order')
-            self.reporter.report(stamp_ns, Level.ERROR, why_not)
+            self.reporter.report(stamp_ns, Level.ERROR, words[found])
             return False
-        if last_ns is not None and stamp_ns < last_ns:
-            stamps = self._stamps
-            self.reset(f'the stamps of the images went back by {1e-9 * (last_ns - stamp_ns):.3f} s')
+        if found is InTime.JUMPED and step_s < 0:
+            self.reset(f'the stamps of the images went back by {-step_s:.3f} s')
             self._stamps = stamps
         return True
 

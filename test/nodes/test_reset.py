@@ -30,7 +30,7 @@ from segfloor_ros.nodes.messages.arrays import (
 from segfloor_ros.nodes.messages.poses import transform_array
 from segfloor_ros.nodes.messages.topics import MAP_START, TOPICS, to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
-from segfloor_ros.nodes.slam_camera import AGREEING_PAIRS
+from segfloor_ros.nodes.shared.joining import AGREEING
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 S = 1_000_000_000
@@ -118,7 +118,7 @@ def test_a_recording_that_begins_again_gives_the_map_of_a_fresh_run(make_graph) 
     chain.drive(frames)
     again = chain.drive(frames)
     chain.graph.close()
-    assert_same(again, Chain(make_graph).drive(frames[AGREEING_PAIRS - 1 :]))
+    assert_same(again, Chain(make_graph).drive(frames[AGREEING - 1 :]))
 
 
 @pytest.mark.parametrize('how', ['service', 'killed'])

@@ -104,7 +104,7 @@ TO_FILES = {
     'map export': 'map export {made}/home.map {}',
     'map filter': 'map filter {made}/labels.yaml {} --keepout grass',
     'evaluate map --overlay': 'evaluate map {made}/result {made}/result --overlay {}',
-    'evaluate trajectory --plot': 'evaluate trajectory {made}/result/trajectory.txt {made}/result/trajectory.txt --plot {}',
+    'evaluate trajectory --plot': 'evaluate trajectory {path} {path} --plot {}',
     'check --write-baseline': 'check {made}/suite.yaml --out {new} --write-baseline {}',
     'view --out': 'view {made}/result --out {}',
 }
@@ -119,7 +119,8 @@ TO_FOLDERS = {
 
 
 def command(words: str, target: Path | str, made: Path, tmp_path: Path) -> list[str]:
-    filled = {'made': str(made), 'new': str(tmp_path / 'new')}
+    path = made / 'result' / 'trajectory.txt'
+    filled = {'made': str(made), 'new': str(tmp_path / 'new'), 'path': str(path)}
     return [w.replace('{}', str(target)).format(**filled) for w in words.split()]
 
 
