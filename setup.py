@@ -77,6 +77,7 @@ setup(
             'typer>=0.12',
             'rich>=13',
             'rosbags>=0.10',
+            'mcap>=1.1',
             'evo>=1.28',
             'matplotlib>=3.6',
             'junitparser>=3',
