@@ -177,6 +177,8 @@ def _open_cut_mcap(path: Path) -> tuple[dict[str, Topic], ReadMessages]:
                 yield topic, decode(data, kind)
 
     counts = Counter((topic, kind) for topic, kind, _ in messages())
+    if not counts:
+        raise ValueError('it ends before its first chunk does')
     return {topic: Topic(kind, count) for (topic, kind), count in counts.items()}, read
 
 
