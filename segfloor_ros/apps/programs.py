@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from functools import partial
 
-from segfloor_ros.core.processes import end_in_silence_on_signals, open_standard_streams
+from segfloor_ros.core.starting import end_in_silence_on_signals, open_standard_streams
 
 APPS = {
     'stereo_camera': 'segfloor_ros.apps.stereo_camera',

@@ -17,12 +17,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from segfloor_ros.core.starting import SIGNALS, is_ignored_hangup
+
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
-
-BLAS_VARIABLES = 'OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'
-
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def end_with_parent(parent_id: int) -> None:
@@ -34,19 +32,6 @@ def end_with_parent(parent_id: int) -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != parent_id:
         os.kill(os.getpid(), signal.SIGTERM)
-
-
-def limit_threads() -> None:
-    """Use one thread of BLAS whatever the environment says, since the number of threads changes the
-    last digits of a result, and one of OpenCV unless the environment says otherwise; call it before
-    they are imported.
-
-    Matrices and images here are small: a second thread gains little on an idle machine, costs CPU
-    time while it waits for work, and on a busy one the two wait for each other. The stages run side
-    by side instead.
-    """
-    os.environ.update(dict.fromkeys(BLAS_VARIABLES, '1'))
-    os.environ.setdefault('OPENCV_FOR_THREADS_NUM', '1')
 
 
 def start_apart(work: Callable[..., None], *arguments: Any) -> tuple[Connection, SpawnProcess]:
@@ -132,7 +117,7 @@ def _handled_by(
     handle: Callable[[int, FrameType | None], None], signals: Sequence[signal.Signals] = SIGNALS
 ) -> Iterator[Callable[[], None]]:
     """Handle signals within the block otherwise; yields what restores the handlers before."""
-    taken = [number for number in signals if not _is_ignored_hangup(number)]
+    taken = [number for number in signals if not is_ignored_hangup(number)]
     before = {number: signal.signal(number, handle) for number in taken}
 
     def restore() -> None:
@@ -143,11 +128,6 @@ def _handled_by(
         yield restore
     finally:
         restore()
-
-
-def _is_ignored_hangup(number: signal.Signals) -> bool:
-    """Whether a signal is SIGHUP in a program that nohup started."""
-    return number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN
 
 
 _PROC = Path('/proc')
@@ -165,30 +145,3 @@ def rss_mb(process_id: int | None = None) -> float:
         return 0.0
     unit = 1 if sys.platform == 'darwin' else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
-
-
-def end_in_silence_on_signals(status: int | None = None) -> None:
-    """End this process at once, without a traceback, on `SIGNALS` from now on: while modules are
-    imported, and nothing is written yet. status: 128 and the signal's number by default.
-    """
-
-    def end(number: int, frame: FrameType | None) -> None:
-        os._exit(128 + number if status is None else status)
-
-    for number in SIGNALS:
-        if not _is_ignored_hangup(number):
-            signal.signal(number, end)
-
-
-def open_standard_streams() -> None:
-    """Give a program that was started without standard input, output or error an empty one. The
-    next file that it opens would take the number of the missing one, and what is printed.
-    """
-    for number, name in enumerate(('stdin', 'stdout', 'stderr')):
-        try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
-        if getattr(sys, name) is None:
-            mode = 'r' if number == 0 else 'w'
-            setattr(sys, name, os.fdopen(number, mode, closefd=False))

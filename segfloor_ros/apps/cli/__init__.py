@@ -2,7 +2,7 @@
 
 import sys
 
-from segfloor_ros.core.processes import (
+from segfloor_ros.core.starting import (
     end_in_silence_on_signals,
     limit_threads,
     open_standard_streams,

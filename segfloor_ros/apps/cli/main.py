@@ -116,9 +116,9 @@ def run_app(program: typer.Typer) -> None:
         print_error(str(error))
         status = 2
     except OSError as error:  # e.g. a name that is too long, or no space where is printed to
-        where = f'{str(error.filename)[:200]}: ' if error.filename else ''
-        print_error(f'{where}{error.strerror or error}')
-        status = 2
+        where = str(error.filename)[:200] if error.filename else 'standard output'
+        print_error(f'{where}: {error.strerror or error}')
+        status = 2 if error.filename else 1
     sys.exit(_flushed(status))
 
 

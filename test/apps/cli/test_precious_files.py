@@ -58,7 +58,7 @@ def made(tmp_path_factory) -> Path:
     shutil.copy(folder / 'home.map', folder / 'other.map')
     grid = OccupancyGrid(np.zeros((4, 5), np.int8), 0.05, (0.0, 0.0))
     save_map(grid, folder / 'labels.yaml', 'raw', {'classes': ['grass']})
-    (folder / 'suite.yaml').write_text(f'recordings:\n  one:\n    input: {folder / "drive"}\n')
+    (folder / 'suite.yaml').write_text(f'recordings:\n  - input: {folder / "drive"}\n')
     return folder
 
 
