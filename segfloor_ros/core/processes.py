@@ -6,21 +6,18 @@ import contextlib
 import ctypes
 import multiprocessing
 import os
-import resource
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
 
-VARIABLES = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'OPENCV_FOR_THREADS_NUM')
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -34,18 +31,6 @@ def end_with_parent(parent_id: int) -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != parent_id:
         os.kill(os.getpid(), signal.SIGTERM)
-
-
-def limit_threads() -> None:
-    """Use one thread of BLAS and one of OpenCV unless the environment says otherwise; call it
-    before they are imported.
-
-    Matrices and images here are small: a second thread gains little on an idle machine, costs CPU
-    time while it waits for work, and on a busy one the two wait for each other. The stages run side
-    by side instead.
-    """
-    for variable in VARIABLES:
-        os.environ.setdefault(variable, '1')
 
 
 def start_apart(work: Callable[..., None], *arguments: Any) -> tuple[Connection, SpawnProcess]:
@@ -139,20 +124,3 @@ def _handled_by(
         yield restore
     finally:
         restore()
-
-
-_PROC = Path('/proc')
-
-
-def rss_mb(process_id: int | None = None) -> float:
-    """Return the resident memory of this process, or of another one, in MB (10^6 bytes).
-
-    Where there is no /proc, it is the peak of this process so far, and 0 for others.
-    """
-    statm = _PROC / str(process_id or 'self') / 'statm'
-    if statm.exists():
-        return int(statm.read_text().split()[1]) * resource.getpagesize() / 1e6
-    if process_id is not None:
-        return 0.0
-    unit = 1 if sys.platform == 'darwin' else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6

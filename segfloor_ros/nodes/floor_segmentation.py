@@ -9,24 +9,20 @@ import numpy as np
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.calibration import StereoCalibration
-from segfloor_ros.core.camera.images import eye_calibration
+from segfloor_ros.core.camera.calibration import StereoCalibration, eye_calibration
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
-from segfloor_ros.nodes.configuration import FloorSegmentationNodeSettings
-from segfloor_ros.nodes.messages.arrays import (
+from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART
+from segfloor_ros.nodes.messages.images import (
     disparity_message,
-    free_scan_message,
     grey8_image,
     image_message,
-    obstacle_scan_message,
     right_image,
-    scan_message,
 )
-from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART
 from segfloor_ros.nodes.messages.poses import pose_array, transform_array
+from segfloor_ros.nodes.messages.scans import free_scan_message, obstacle_scan_message, scan_message
 from segfloor_ros.nodes.messages.topics import (
     FRAME_PARTS,
     KEYFRAME_PARTS,
@@ -34,7 +30,8 @@ from segfloor_ros.nodes.messages.topics import (
     SEMANTIC_MASK,
     to_ns,
 )
-from segfloor_ros.nodes.shared.maps import KeyframeJoin
+from segfloor_ros.nodes.settings.floor import FloorSegmentationNodeSettings
+from segfloor_ros.nodes.shared.keyframes import KeyframeJoin
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
 

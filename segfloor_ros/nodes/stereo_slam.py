@@ -16,9 +16,9 @@ from segfloor_ros.core.plugins.maps.saved_slam import (
     saved_camera,
 )
 from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE, StereoSlam
-from segfloor_ros.nodes.configuration import StereoSlamNodeSettings
 from segfloor_ros.nodes.messages.diagnostics import Level
 from segfloor_ros.nodes.messages.topics import FRAME_DONE, make_header
+from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import CHECK_S
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode

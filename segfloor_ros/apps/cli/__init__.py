@@ -2,7 +2,7 @@
 
 import sys
 
-from segfloor_ros.core.processes import limit_threads
+from segfloor_ros.core.threads import limit_threads
 
 limit_threads()
 

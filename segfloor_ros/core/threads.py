@@ -1,0 +1,19 @@
+"""How many threads the libraries use."""
+
+from __future__ import annotations
+
+import os
+
+VARIABLES = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'OPENCV_FOR_THREADS_NUM')
+
+
+def limit_threads() -> None:
+    """Use one thread of BLAS and one of OpenCV unless the environment says otherwise; call it
+    before they are imported.
+
+    Matrices and images here are small: a second thread gains little on an idle machine, costs CPU
+    time while it waits for work, and on a busy one the two wait for each other. The stages run side
+    by side instead.
+    """
+    for variable in VARIABLES:
+        os.environ.setdefault(variable, '1')
