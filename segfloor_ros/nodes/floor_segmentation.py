@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from segfloor_ros.core.camera.calibration import StereoCalibration, eye_calibration
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import Mount
-from segfloor_ros.core.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART
 from segfloor_ros.nodes.messages.images import (
@@ -158,9 +157,13 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         if out.listeners('keyframe/disparity'):
             out.publish('keyframe/disparity', disparity_message(*at, camera, floor))
         if out.listeners('keyframe/floor_overlay'):
+            from segfloor_ros.core.floor.pictures import mask_overlay
+
             picture = mask_overlay(left, floor.mask)
             out.publish('keyframe/floor_overlay', image_message(*at, picture, 'bgr8'))
         if out.listeners('keyframe/v_disparity'):
+            from segfloor_ros.core.floor.pictures import v_disparity_picture
+
             picture = v_disparity_picture(floor)
             out.publish('keyframe/v_disparity', image_message(*at, picture, 'bgr8'))
         return {'remarks': REMARKS_APART.join(remarks.values())}

@@ -12,7 +12,6 @@ from rclpy.timer import Timer
 from segfloor_ros.core.errors import MapError, SettingsError
 from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.grid.mapper import OccupancyGridMapper
-from segfloor_ros.nodes.map_files import save_map
 from segfloor_ros.nodes.messages.grids import grid_message
 from segfloor_ros.nodes.messages.points import features_arrays, labelled_arrays
 from segfloor_ros.nodes.messages.poses import path_arrays
@@ -100,6 +99,8 @@ class OccupancyGridNode(StageNode[OccupancyGridNodeSettings]):
         path = FilePath(name).expanduser().absolute()
         if path.suffix not in YAML_SUFFIXES:
             path = path.with_name(f'{path.name}.yaml')
+        from segfloor_ros.nodes.map_files import save_map
+
         save_map(self._stage.grid(), path)
         return str(path)
 

@@ -17,14 +17,10 @@ from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import KeyframePath, Mount
 from segfloor_ros.core.plugins.semantics.label_map import LabelMap, numbered
 from segfloor_ros.core.plugins.semantics.network import ImageLabeller, NetworkSettings
+from segfloor_ros.nodes.messages.colours import colour8_image
 from segfloor_ros.nodes.messages.diagnostics import Level
 from segfloor_ros.nodes.messages.grids import grid_message, grid_of
-from segfloor_ros.nodes.messages.images import (
-    colour8_image,
-    depth_image,
-    grey8_image,
-    image_message,
-)
+from segfloor_ros.nodes.messages.images import depth_image, grey8_image, image_message
 from segfloor_ros.nodes.messages.points import features_arrays
 from segfloor_ros.nodes.messages.poses import path_arrays, transform_array
 from segfloor_ros.nodes.messages.scans import scan_arrays

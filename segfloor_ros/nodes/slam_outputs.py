@@ -24,10 +24,7 @@ from segfloor_ros.core.camera.pixels import Region, shrink_factor, shrunk_camera
 from segfloor_ros.core.contracts import FrameResult, Keyframe, LoadedMap, Mount, StereoFrame
 from segfloor_ros.core.errors import MapError, SettingsError
 from segfloor_ros.core.files.arrays import MapFile
-from segfloor_ros.core.files.results import read_map_file, write_map_file
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.plugins.maps.pruning import prune_file
-from segfloor_ros.core.plugins.maps.saved_slam import save_slam
 from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.nodes.messages import odometry as odometry_messages
@@ -35,7 +32,8 @@ from segfloor_ros.nodes.messages import points, poses
 from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART, Level
 from segfloor_ros.nodes.messages.images import image_message
-from segfloor_ros.nodes.messages.saved_maps import map_file_message, map_file_of, map_start_message
+from segfloor_ros.nodes.messages.map_starts import map_start_message
+from segfloor_ros.nodes.messages.saved_maps import map_file_message, map_file_of
 from segfloor_ros.nodes.messages.topics import (
     CORRECTED,
     FRAME_PARTS,
@@ -384,7 +382,11 @@ class SlamMaps:
     def read(self) -> MapFile | None:
         """Return the map of the parameter `load_map`, None where it is empty. Raises InputError."""
         self.loaded, name = None, self._own.load_map
-        return read_map_file(Path(name).expanduser()) if name else None
+        if not name:
+            return None
+        from segfloor_ros.core.files.results import read_map_file
+
+        return read_map_file(Path(name).expanduser())
 
     def keep(self, slam: StereoSlam) -> None:
         """Keep what a later life of this node goes on from, where there are new keyframes."""
@@ -417,6 +419,8 @@ class SlamMaps:
         slam = self._slam()
         if slam is None:
             raise MapError('there is no map yet that could be saved')
+        from segfloor_ros.core.plugins.maps.saved_slam import save_slam
+
         saved = save_slam(slam, slam.rig.camera)
         saved.header['start_ns'] = self._topics.map_start_ns
         return saved
@@ -446,6 +450,8 @@ class SlamMaps:
 
     async def _prune(self) -> str:
         """Prune the file of `save_map` beside tracking; the map in use stays as it is."""
+        from segfloor_ros.core.plugins.maps.pruning import prune_file
+
         said: list[str] = []
         path = self._file_to_save()
         await _in_background(lambda: said.append(prune_file(path)))
@@ -467,6 +473,8 @@ class SlamMaps:
                 if part.header['start_ns'] != start_ns:
                     raise MapError('the map was reset while it was saved')
                 saved.parts |= part.parts
+            from segfloor_ros.core.files.results import write_map_file
+
             await _in_background(partial(write_map_file, path, saved))
         finally:
             self._node.destroy_timer(give_up)

@@ -31,9 +31,9 @@ from segfloor_ros.core.camera.recording import (
 from segfloor_ros.core.contracts import MAX_KEYFRAMES_UNDER_WAY, Measurement, WheelPose
 from segfloor_ros.core.errors import InputError, SegfloorError
 from segfloor_ros.core.geometry import Array, make_transform
-from segfloor_ros.nodes.messages.camera_infos import camera_info_message
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, compressed_message
 from segfloor_ros.nodes.messages.diagnostics import RECORDING, Level
-from segfloor_ros.nodes.messages.images import compressed_message, image_message
+from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.poses import transform_message
 from segfloor_ros.nodes.messages.sensors import imu_message, wheel_message
 from segfloor_ros.nodes.messages.topics import (

@@ -21,9 +21,9 @@ from segfloor_ros.nodes.configuration import resolve
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.images import image_message
+from segfloor_ros.nodes.messages.map_starts import map_start_message, map_start_ns
 from segfloor_ros.nodes.messages.points import labelled_arrays
 from segfloor_ros.nodes.messages.poses import transform_array
-from segfloor_ros.nodes.messages.saved_maps import map_start_message, map_start_ns
 from segfloor_ros.nodes.messages.topics import MAP_START, TOPICS, to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode

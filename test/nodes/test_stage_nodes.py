@@ -44,9 +44,13 @@ from segfloor_ros.core.grid.mapper import OccupancyGridMapper
 from segfloor_ros.core.grid.occupancy import OccupancyGridSettings
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
+from segfloor_ros.nodes.messages.camera_infos import (
+    camera_info_message,
+    compressed_message,
+    rectified_calibration,
+)
 from segfloor_ros.nodes.messages.diagnostics import Level, Status
-from segfloor_ros.nodes.messages.images import compressed_message, grey8_image, image_message
+from segfloor_ros.nodes.messages.images import grey8_image, image_message
 from segfloor_ros.nodes.messages.points import (
     features_message,
     labelled_arrays,

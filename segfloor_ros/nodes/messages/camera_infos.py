@@ -1,11 +1,13 @@
-"""Calibrations as messages."""
+"""What a camera publishes besides raw images: calibrations and compressed images."""
 
 from __future__ import annotations
 
 import array
 
+import cv2
 import numpy as np
-from sensor_msgs.msg import CameraInfo
+from numpy.typing import NDArray
+from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.model import StereoCamera
@@ -46,3 +48,20 @@ def rectified_calibration(camera: StereoCamera) -> StereoCalibration:
     P[0, 3] = -camera.disparity_times_depth
     right = EyeCalibration.of_rectified(camera.width, camera.height, P)
     return StereoCalibration(left, right)
+
+
+def compressed_message(
+    stamp_ns: int, frame_id: str, image: NDArray[np.generic], jpeg_quality: int | None
+) -> CompressedImage:
+    """Return a grey image (H, W) as a message as image_transport makes it: JPEG of a quality of
+    1 to 100, or PNG, without loss, where that is None or the image has 16 bits.
+    """
+    kind = 'png' if jpeg_quality is None or image.dtype == np.uint16 else 'jpeg'
+    options = [] if kind == 'png' else [cv2.IMWRITE_JPEG_QUALITY, int(jpeg_quality or 0)]
+    _, data = cv2.imencode(f'.{kind}', np.ascontiguousarray(image), options)
+    encoding = 'mono16' if image.dtype == np.uint16 else 'mono8'
+    return CompressedImage(
+        header=make_header(stamp_ns, frame_id),
+        format=f'{encoding}; {kind} compressed {encoding}',
+        data=array.array('B', data.tobytes()),
+    )

@@ -8,13 +8,12 @@ from __future__ import annotations
 import array
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from sensor_msgs.msg import CompressedImage, Image
+from sensor_msgs.msg import Image
 from stereo_msgs.msg import DisparityImage
 
-from segfloor_ros.core.camera.images import colour_image, depth_image, grey_image
+from segfloor_ros.core.camera.images import depth_image, grey_image
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.camera.pixels import Grey
 from segfloor_ros.core.contracts import FloorObservation
@@ -45,47 +44,15 @@ def image_message(
     )
 
 
-def compressed_message(
-    stamp_ns: int, frame_id: str, image: NDArray[np.generic], jpeg_quality: int | None
-) -> CompressedImage:
-    """Return a grey image (H, W) as a message as image_transport makes it: JPEG of a quality of
-    1 to 100, or PNG, without loss, where that is None or the image has 16 bits.
-    """
-    kind = 'png' if jpeg_quality is None or image.dtype == np.uint16 else 'jpeg'
-    options = [] if kind == 'png' else [cv2.IMWRITE_JPEG_QUALITY, int(jpeg_quality or 0)]
-    _, data = cv2.imencode(f'.{kind}', np.ascontiguousarray(image), options)
-    encoding = 'mono16' if image.dtype == np.uint16 else 'mono8'
-    return CompressedImage(
-        header=make_header(stamp_ns, frame_id),
-        format=f'{encoding}; {kind} compressed {encoding}',
-        data=array.array('B', data.tobytes()),
-    )
-
-
 def grey8_image(message: Image, topic: str) -> NDArray[np.uint8]:
     """Return the grey image (H, W) of a message of 8 bits. Raises InputError."""
     return _eight_bit(grey_image(message, topic), message, topic)
-
-
-def colour8_image(message: Image, topic: str) -> NDArray[np.uint8]:
-    """Return the image of a message of 8 bits, (H, W, 3) BGR, or (H, W) where it has no colours.
-    Raises InputError.
-    """
-    return _eight_bit(colour_image(message, topic), message, topic)
 
 
 def _eight_bit(image: Grey, message: Image, topic: str) -> NDArray[np.uint8]:
     if image.dtype != np.uint8:
         raise InputError(f'{topic}: {message.encoding} has 16 bits, expected 8')
     return image.astype(np.uint8, copy=False)
-
-
-def bgr_image(message: Image, topic: str) -> NDArray[np.uint8]:
-    """Return the picture (H, W, 3) of a message of encoding bgr8. Raises InputError."""
-    row = np.frombuffer(message.data, np.uint8)
-    if message.encoding != 'bgr8' or len(row) != message.height * message.width * 3:
-        raise InputError(f'{topic}: {message.encoding} or its size is not that of a bgr8 picture')
-    return row.reshape(message.height, message.width, 3)
 
 
 def right_image(message: Image, topic: str) -> NDArray[Any]:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import array
 
-from sensor_msgs.msg import TimeReference
 from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
 
 from segfloor_ros.core.files.arrays import MapFile
-from segfloor_ros.nodes.messages.topics import make_header, to_ns, to_time
 
 
 def map_file_message(saved: MapFile) -> UInt8MultiArray:
@@ -25,29 +23,3 @@ def map_file_of(message: UInt8MultiArray, topic: str) -> MapFile:
     from segfloor_ros.core.files.results import from_bytes
 
     return from_bytes(bytes(message.data), topic)
-
-
-def map_start_message(
-    stamp_ns: int, frame_id: str, start_ns: int, is_loaded: bool = False
-) -> TimeReference:
-    """Return that the keyframe of a stamp belongs to the map that was begun at `start_ns`.
-    is_loaded: with what was loaded.
-    """
-    return TimeReference(
-        header=make_header(stamp_ns, frame_id),
-        time_ref=to_time(start_ns),
-        source=LOADED if is_loaded else BEGUN,
-    )
-
-
-def map_start_ns(message: TimeReference) -> int:
-    """Return when the keyframe's map was begun."""
-    return to_ns(message.time_ref)
-
-
-def is_of_loaded_map(message: TimeReference) -> bool:
-    """Whether the keyframe's map goes on from a file."""
-    return message.source == LOADED
-
-
-BEGUN, LOADED = 'stereo_slam', 'map file'

@@ -11,7 +11,7 @@ from typing import Any
 from sensor_msgs.msg import TimeReference
 
 from segfloor_ros.nodes.messages.diagnostics import Level
-from segfloor_ros.nodes.messages.saved_maps import is_of_loaded_map, map_start_ns
+from segfloor_ros.nodes.messages.map_starts import is_of_loaded_map, map_start_ns
 from segfloor_ros.nodes.messages.topics import KEYFRAME_DONE, KEYFRAMES, MAP_START, make_header
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 

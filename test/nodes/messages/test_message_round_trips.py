@@ -26,11 +26,20 @@ from segfloor_ros.core.errors import CalibrationError, InputError
 from segfloor_ros.core.geometry import R_ROS_OPTICAL, make_transform
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.twists import se3_exp
-from segfloor_ros.nodes.messages import grids, images, odometry, points, poses, scans, sensors
+from segfloor_ros.nodes.messages import (
+    camera_infos,
+    grids,
+    images,
+    odometry,
+    points,
+    poses,
+    scans,
+    sensors,
+)
 from segfloor_ros.nodes.messages import images as arrays
 from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import Level, Status, status_message, statuses
-from segfloor_ros.nodes.messages.saved_maps import map_start_message, map_start_ns
+from segfloor_ros.nodes.messages.map_starts import map_start_message, map_start_ns
 from segfloor_ros.nodes.messages.topics import to_ns, to_time
 
 STAMP_NS = 1_403_715_273_262_142_976
@@ -80,19 +89,19 @@ def test_an_image_that_contradicts_itself_is_refused_by_name(change) -> None:
 def test_a_png_survives_and_a_jpeg_nearly(dtype) -> None:
     y, x = np.mgrid[0:40, 0:60]
     image = (100 + 50 * np.sin(x / 9) + y).astype(dtype)
-    exact = over_the_wire(images.compressed_message(STAMP_NS, 'left', image, None))
+    exact = over_the_wire(camera_infos.compressed_message(STAMP_NS, 'left', image, None))
     assert (to_ns(exact.header.stamp), exact.header.frame_id) == (STAMP_NS, 'left')
     found = arrays.grey_image(exact, 'left/image_raw/compressed')
     np.testing.assert_array_equal(found, image)
     assert found.dtype == dtype
-    small = over_the_wire(images.compressed_message(STAMP_NS, 'left', image, 90))
+    small = over_the_wire(camera_infos.compressed_message(STAMP_NS, 'left', image, 90))
     assert small.format.endswith('mono8' if dtype == np.uint8 else 'mono16')
     lossy = arrays.grey_image(small, 'left/image_raw/compressed')
     assert np.abs(lossy.astype(int) - image.astype(int)).max() <= (8 if dtype == np.uint8 else 0)
 
 
 def test_a_damaged_file_is_refused_by_topic() -> None:
-    message = images.compressed_message(STAMP_NS, 'left', np.zeros((40, 60), np.uint8), 90)
+    message = camera_infos.compressed_message(STAMP_NS, 'left', np.zeros((40, 60), np.uint8), 90)
     message.data = message.data[:-9]
     with pytest.raises(InputError, match='left/image_raw/compressed: the JPEG is truncated'):
         arrays.grey_image(message, 'left/image_raw/compressed')
@@ -130,11 +139,11 @@ def _camera() -> StereoCamera:
 
 def test_poses_paths_and_transforms_survive() -> None:
     stack = se3_exp(RNG.normal(size=(4, 6)))
-    odometry = over_the_wire(
+    message = over_the_wire(
         odometry.odometry_message(STAMP_NS, 'odom', 'base_link', stack[0], np.diag(np.arange(6.0)))
     )
-    np.testing.assert_allclose(poses.pose_array(odometry.pose.pose), stack[0], atol=1e-15)
-    np.testing.assert_array_equal(odometry.pose.covariance.reshape(6, 6), np.diag(np.arange(6.0)))
+    np.testing.assert_allclose(poses.pose_array(message.pose.pose), stack[0], atol=1e-15)
+    np.testing.assert_array_equal(message.pose.covariance.reshape(6, 6), np.diag(np.arange(6.0)))
     path = KeyframePath(np.array([5, 7, STAMP_NS, STAMP_NS + 1]), stack)
     back = poses.path_arrays(over_the_wire(poses.PathMessages('map').next(STAMP_NS, path)))
     np.testing.assert_array_equal(back.stamp_ns, path.stamp_ns)
@@ -291,7 +300,7 @@ def test_labelled_points_survive_and_are_told_apart() -> None:
 def test_a_foreign_cloud_is_read_by_its_field_names() -> None:
     """Big endian, doubles, other order, padded rows and two rows."""
     dtype = np.dtype([('id', '>i4'), ('z', '>f8'), ('y', '>f8'), ('x', '>f8')])
-    points = np.array([(7, 3, 2, 1), (8, 6, 5, 4)], dtype)
+    rows = np.array([(7, 3, 2, 1), (8, 6, 5, 4)], dtype)
     message = points.sparse_cloud_message(
         0, 'map', SparseCloud(np.zeros(0, np.int32), np.zeros((0, 3)))
     )
@@ -300,7 +309,7 @@ def test_a_foreign_cloud_is_read_by_its_field_names() -> None:
         field.offset, field.datatype = offsets[field.name], 5 if field.name == 'id' else 8
     message.is_bigendian, message.point_step = True, 28
     message.height, message.width, message.row_step = 2, 1, 32
-    padded = b''.join(p.tobytes() + b'junk' for p in points)
+    padded = b''.join(p.tobytes() + b'junk' for p in rows)
     message.data = type(message.data)('B', padded)
     back = points.sparse_cloud_arrays(message, 'map_points')
     assert back.point_id.tolist() == [7, 8]
