@@ -19,7 +19,7 @@ from tf2_ros import Buffer, TransformListener
 
 import segfloor_ros.apps.simulation
 from segfloor_ros.nodes.map_files import save_map
-from segfloor_ros.nodes.messages.arrays import grid_of
+from segfloor_ros.nodes.messages.grids import grid_of
 from segfloor_ros.nodes.messages.topics import TOPICS
 
 DRIVE = Path(segfloor_ros.apps.simulation.__file__).parent / 'demo' / 'drive.mcap'

@@ -17,12 +17,9 @@ from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.apps.programs import program_of
 from segfloor_ros.core.contracts import StereoFrame
-from segfloor_ros.nodes.messages.arrays import (
-    camera_info_message,
-    image_message,
-    rectified_calibration,
-)
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import CONNECTIONS, Status
+from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.topics import CLOUD, FLOOR, GRID, SLAM, published_by
 
 CHAIN = (SLAM, FLOOR, CLOUD, GRID)

@@ -16,14 +16,15 @@ from segfloor_ros.core.contracts import (
     SparseCloud,
 )
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.nodes.messages.arrays import (
+from segfloor_ros.nodes.messages.images import image_message
+from segfloor_ros.nodes.messages.odometry import odometry_message
+from segfloor_ros.nodes.messages.points import (
     features_message,
-    image_message,
     labelled_message,
-    scan_message,
     sparse_cloud_message,
 )
-from segfloor_ros.nodes.messages.poses import PathMessages, odometry_message
+from segfloor_ros.nodes.messages.poses import PathMessages
+from segfloor_ros.nodes.messages.scans import scan_message
 
 STAMP_NS = 12_345_678_901
 AT_ORIGIN = np.eye(4)

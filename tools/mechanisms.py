@@ -80,7 +80,7 @@ def _begun_anywhere(view: Any, mask: Any, alike: Any, may_begin: Any, *others: A
 
 SLAM: dict[str, Mechanism] = {
     NOTHING: Mechanism(),
-    'deblocking': Mechanism({'core.camera.calibration.deblocked': _first}),
+    'deblocking': Mechanism({'core.camera.rectification.deblocked': _first}),
     'fusion of points': Mechanism({'core.slam.mapping.keyframe_mapping.fuse_duplicates': _none}),
     'place keyframes in the local map': Mechanism(
         {'core.slam.tracking.map_tracking.views_near': _no_rows}

@@ -31,6 +31,7 @@ from segfloor_ros.apps.evaluation.map_score import (
 from segfloor_ros.apps.evaluation.maps import MapTruth, Mask, load_truth, observable
 from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.apps.lockstep import LockstepRun
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.results_folder import OutputFolder
 from segfloor_ros.apps.simulation.scene import Scene
@@ -41,7 +42,6 @@ from segfloor_ros.core.files.whole import read_table
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED
 from segfloor_ros.nodes.configuration import resolve
-from segfloor_ros.nodes.map_files import load_map
 
 SEEN_AGAIN_S = 10.0
 ENOUGH_S = 1.0

@@ -31,9 +31,9 @@ from segfloor_ros.apps.trajectory import TrackedPose, corrected_trajectory, read
 from segfloor_ros.core.contracts import FrameResult, KeyframePath, StereoFrame
 from segfloor_ros.core.files.results import from_bytes, to_bytes
 from segfloor_ros.core.geometry import Array, invert, rotation_angle
+from segfloor_ros.core.memory import rss_mb
 from segfloor_ros.core.plugins.assembly import make_slam
 from segfloor_ros.core.plugins.maps.saved_slam import load_slam, save_slam
-from segfloor_ros.core.processes import rss_mb
 from segfloor_ros.core.slam.places.loops import Candidate
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.nodes.configuration import resolve

@@ -31,7 +31,7 @@ from segfloor_ros.core.pipeline import Pipeline
 from segfloor_ros.core.plugins.assembly import make_pipeline
 from segfloor_ros.core.plugins.maps.map_arrays import fill_map
 from segfloor_ros.core.plugins.maps.pruning import prune
-from segfloor_ros.core.plugins.maps.saved_slam import load_pipeline, save_pipeline
+from segfloor_ros.core.plugins.maps.saved_pipeline import load_pipeline, save_pipeline
 from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.core.slam.rig import Rig

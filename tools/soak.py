@@ -14,8 +14,8 @@ from segfloor_ros.apps.recordings import StereoSource
 from segfloor_ros.core.contracts import FrameResult
 from segfloor_ros.core.errors import MapError
 from segfloor_ros.core.geometry import Array, invert
+from segfloor_ros.core.memory import rss_mb
 from segfloor_ros.core.pipeline import Pipeline
-from segfloor_ros.core.processes import rss_mb
 from tools.driving import drive
 from tools.endless_drive import place_of
 

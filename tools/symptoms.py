@@ -21,12 +21,12 @@ from segfloor_ros.apps.cli.main import run_command
 from segfloor_ros.apps.cli.terminal import announcing, console
 from segfloor_ros.apps.evaluation.map_score import compare, draw_overlay
 from segfloor_ros.apps.evaluation.maps import load_truth
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.ply import read_ply
 from segfloor_ros.apps.simulation.scene_file import open_scene
 from segfloor_ros.apps.simulation.simulation import RecordingOptions, render_once
 from segfloor_ros.apps.suite.job import ProgramError, run_segfloor
 from segfloor_ros.core.contracts import POINT_FLOOR, POINT_OBSTACLE
-from segfloor_ros.nodes.map_files import load_map
 
 SMALL = ('camera.width=480', 'camera.height=360')
 WIDTH_PX = 640

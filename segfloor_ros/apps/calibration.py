@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.apps.recordings.calibration_files import ros_calibration
+from segfloor_ros.apps.recordings.extrinsics import calibration_from_extrinsics
 from segfloor_ros.apps.recordings.image_folders import find_image_pairs
 from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.pixels import Grey
 from segfloor_ros.core.contracts import InputFault, StereoFrame
-from segfloor_ros.core.errors import CalibrationError, InputError
-from segfloor_ros.core.files.images import CorruptImageError, Grey, read_grey
+from segfloor_ros.core.errors import CalibrationError, CorruptImageError, InputError
+from segfloor_ros.core.files.images import read_grey
 from segfloor_ros.core.files.writing import PAGE as HTML
 from segfloor_ros.core.files.writing import YAML, check_output, write_output
 from segfloor_ros.core.geometry import Array, make_transform
@@ -405,7 +407,7 @@ def _solve(
         EyeCalibration.of_raw(size, K, D.ravel()[:5], origin=name) for K, D in ((K1, D1), (K2, D2))
     )
     T_right_left = make_transform(R, t.ravel())
-    calibration = StereoCalibration.from_extrinsics(left_eye, right_eye, T_right_left)
+    calibration = calibration_from_extrinsics(left_eye, right_eye, T_right_left)
     return calibration, float(rms_px), np.asarray(errors_px).reshape(-1, 2)
 
 

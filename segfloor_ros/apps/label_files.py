@@ -8,12 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.core.errors import InputError, SettingsError
 from segfloor_ros.core.grid.occupancy import FREE, UNKNOWN, OccupancyGrid
 from segfloor_ros.core.plugins.semantics.label_map import Labels, numbered
 from segfloor_ros.core.plugins.semantics.outputs import UNLABELLED
 from segfloor_ros.core.settings import suggestion
-from segfloor_ros.nodes.map_files import load_map, save_map
+from segfloor_ros.nodes.map_files import save_map
 from segfloor_ros.nodes.yaml_files import read_yaml
 
 HUE_STEP = 111.2

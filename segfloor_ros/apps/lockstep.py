@@ -42,12 +42,8 @@ from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.pipeline import KeyframeStages, Pipeline
 from segfloor_ros.core.plugins.assembly import make_pipeline
-from segfloor_ros.core.plugins.maps.saved_slam import (
-    check_camera,
-    load_pipeline,
-    new_keyframes,
-    save_pipeline,
-)
+from segfloor_ros.core.plugins.maps.saved_pipeline import load_pipeline, save_pipeline
+from segfloor_ros.core.plugins.maps.saved_slam import check_camera, new_keyframes
 from segfloor_ros.core.plugins.rig.check import SETTLED_FRAMES
 from segfloor_ros.core.plugins.semantics.label_map import Labels
 from segfloor_ros.core.plugins.semantics.network import ImageLabeller, Network

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from segfloor_ros.core.processes import rss_mb
+from segfloor_ros.core.memory import rss_mb
 from segfloor_ros.core.timing import MAX_SAMPLES
 
 

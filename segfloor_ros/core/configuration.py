@@ -13,9 +13,6 @@ from segfloor_ros.core.grid.occupancy import OccupancyGridSettings
 from segfloor_ros.core.settings import StageSettings
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 
-MAX_KEYFRAMES_UNDER_WAY = 4
-"""Keyframes that may be between SLAM and the grid while the next frame is taken."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Configuration:

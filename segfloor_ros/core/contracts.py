@@ -530,3 +530,7 @@ class Semantics(Protocol):
 
     def from_parts(self, parts: dict[str, Arrays], shift_ns: int) -> None:
         """Go on with the parts of a saved map, whose stamps are later by shift_ns."""
+
+
+MAX_KEYFRAMES_UNDER_WAY = 4
+"""Keyframes that may be between SLAM and the grid while the next frame is taken."""

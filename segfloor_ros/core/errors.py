@@ -69,3 +69,7 @@ def os_errors(what: str, advice: str = '') -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(f'{what} ({error.strerror}){advice}') from None
+
+
+class CorruptImageError(InputError):
+    """The data of one image is damaged; the rest of the recording may be fine."""

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.cloud import CloudLabelling
-from segfloor_ros.core.configuration import MAX_KEYFRAMES_UNDER_WAY, Configuration
+from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.contracts import (
+    MAX_KEYFRAMES_UNDER_WAY,
     FloorObservation,
     FloorScan,
     FrameResult,

@@ -197,3 +197,6 @@ class RobotSettings(StageSettings):
     def robot(self) -> dict[str, float]:
         """The robot alone: height, step and drop in metres by name."""
         return {spec.name: getattr(self, spec.name) for spec in RobotSettings.specs()}
+
+
+ROBOT_PARAMETERS = [spec.name for spec in RobotSettings.specs()]

@@ -1,8 +1,4 @@
-"""How long each step takes, and how much memory a process has.
-
-A fixed piece of OpenCV work, timed beside the stages: times as multiples of it can be compared
-between machines.
-"""
+"""How long each step takes: stages, and the steps within them."""
 
 from __future__ import annotations
 

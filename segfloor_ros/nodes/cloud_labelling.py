@@ -14,13 +14,14 @@ from rclpy.task import Future
 from segfloor_ros.core.cloud import CloudLabelling
 from segfloor_ros.core.contracts import POINT_FLOOR, LabelledPoints, SparseCloud
 from segfloor_ros.core.files.arrays import MapFile
-from segfloor_ros.core.settings import RobotSettings
-from segfloor_ros.nodes.configuration import ROBOT_PARAMETERS, CloudLabellingNodeSettings
-from segfloor_ros.nodes.messages import arrays
-from segfloor_ros.nodes.messages.arrays import grey8_image
+from segfloor_ros.core.settings import ROBOT_PARAMETERS, RobotSettings
+from segfloor_ros.nodes.messages import points
+from segfloor_ros.nodes.messages.images import grey8_image
 from segfloor_ros.nodes.messages.poses import pose_array
 from segfloor_ros.nodes.messages.topics import FRESH_S, to_ns
-from segfloor_ros.nodes.shared.maps import KeyframeJoin, MapPart
+from segfloor_ros.nodes.settings.cloud import CloudLabellingNodeSettings
+from segfloor_ros.nodes.shared.keyframes import KeyframeJoin
+from segfloor_ros.nodes.shared.map_parts import MapPart
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
 
@@ -102,13 +103,13 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
         self._stage.settings = self.settings
 
     def _label(self, stamp_ns: int, parts: Mapping[str, Any]) -> dict[str, Any]:
-        cloud = arrays.sparse_cloud_arrays(parts[MAP_POINTS], MAP_POINTS)
-        features = arrays.features_arrays(parts[FEATURES], FEATURES)
+        cloud = points.sparse_cloud_arrays(parts[MAP_POINTS], MAP_POINTS)
+        features = points.features_arrays(parts[FEATURES], FEATURES)
         mask = grey8_image(parts[MASK], MASK)
         T_map_base = pose_array(parts[POSE].pose.pose)
         labelled = self._stage.update(cloud, features, mask, T_map_base)
         frame_id = parts[MAP_POINTS].header.frame_id
-        message = arrays.labelled_message(stamp_ns, frame_id, labelled)
+        message = points.labelled_message(stamp_ns, frame_id, labelled)
         self.outputs.publish('labelled_points', message)
         self._publish_by_label(stamp_ns, frame_id, labelled)
         self._part.note(stamp_ns, frame_id)
@@ -118,7 +119,7 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
         """Publish floor and obstacles, each while someone listens."""
         if self.outputs.listeners('floor_points'):
             rows = np.flatnonzero(labelled.label == POINT_FLOOR)
-            floor = arrays.points_at(stamp_ns, frame_id, labelled, rows)
+            floor = points.points_at(stamp_ns, frame_id, labelled, rows)
             self.outputs.publish('floor_points', floor)
         self._newest, self._listeners = (frame_id, labelled), 0
         self._publish_obstacles(stamp_ns)
@@ -147,7 +148,7 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
             return
         frame_id, labelled = self._newest
         rows = self._stage.standing(labelled) if self._listeners > before else np.zeros(0, np.intp)
-        message = arrays.points_at(stamp_ns, frame_id, labelled, rows)
+        message = points.points_at(stamp_ns, frame_id, labelled, rows)
         self.outputs.publish('obstacle_points', message)
 
 

@@ -9,24 +9,19 @@ import numpy as np
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.calibration import StereoCalibration
-from segfloor_ros.core.camera.images import eye_calibration
+from segfloor_ros.core.camera.calibration import StereoCalibration, eye_calibration
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import Mount
-from segfloor_ros.core.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
-from segfloor_ros.nodes.configuration import FloorSegmentationNodeSettings
-from segfloor_ros.nodes.messages.arrays import (
+from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART
+from segfloor_ros.nodes.messages.images import (
     disparity_message,
-    free_scan_message,
     grey8_image,
     image_message,
-    obstacle_scan_message,
     right_image,
-    scan_message,
 )
-from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART
 from segfloor_ros.nodes.messages.poses import pose_array, transform_array
+from segfloor_ros.nodes.messages.scans import free_scan_message, obstacle_scan_message, scan_message
 from segfloor_ros.nodes.messages.topics import (
     FRAME_PARTS,
     KEYFRAME_PARTS,
@@ -34,7 +29,8 @@ from segfloor_ros.nodes.messages.topics import (
     SEMANTIC_MASK,
     to_ns,
 )
-from segfloor_ros.nodes.shared.maps import KeyframeJoin
+from segfloor_ros.nodes.settings.floor import FloorSegmentationNodeSettings
+from segfloor_ros.nodes.shared.keyframes import KeyframeJoin
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
 
@@ -161,9 +157,13 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         if out.listeners('keyframe/disparity'):
             out.publish('keyframe/disparity', disparity_message(*at, camera, floor))
         if out.listeners('keyframe/floor_overlay'):
+            from segfloor_ros.core.floor.pictures import mask_overlay
+
             picture = mask_overlay(left, floor.mask)
             out.publish('keyframe/floor_overlay', image_message(*at, picture, 'bgr8'))
         if out.listeners('keyframe/v_disparity'):
+            from segfloor_ros.core.floor.pictures import v_disparity_picture
+
             picture = v_disparity_picture(floor)
             out.publish('keyframe/v_disparity', image_message(*at, picture, 'bgr8'))
         return {'remarks': REMARKS_APART.join(remarks.values())}

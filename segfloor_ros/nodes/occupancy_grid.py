@@ -12,16 +12,13 @@ from segfloor_ros.core.errors import MapError, SettingsError
 from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.files.whole import user_path
 from segfloor_ros.core.grid.mapper import OccupancyGridMapper
-from segfloor_ros.nodes.configuration import OccupancyGridNodeSettings
-from segfloor_ros.nodes.map_files import save_map
-from segfloor_ros.nodes.messages.arrays import (
-    features_arrays,
-    grid_message,
-    labelled_arrays,
-    scan_arrays,
-)
+from segfloor_ros.nodes.messages.grids import grid_message
+from segfloor_ros.nodes.messages.points import features_arrays, labelled_arrays
 from segfloor_ros.nodes.messages.poses import path_arrays
-from segfloor_ros.nodes.shared.maps import KeyframeJoin, MapPart
+from segfloor_ros.nodes.messages.scans import scan_arrays
+from segfloor_ros.nodes.settings.grid import OccupancyGridNodeSettings
+from segfloor_ros.nodes.shared.keyframes import KeyframeJoin
+from segfloor_ros.nodes.shared.map_parts import MapPart
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
 
@@ -102,6 +99,8 @@ class OccupancyGridNode(StageNode[OccupancyGridNodeSettings]):
         path = user_path(name).absolute()
         if path.suffix not in YAML_SUFFIXES:
             path = path.with_name(f'{path.name}.yaml')
+        from segfloor_ros.nodes.map_files import save_map
+
         save_map(self._stage.grid(), path)
         return str(path)
 

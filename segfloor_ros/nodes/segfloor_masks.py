@@ -17,19 +17,13 @@ from segfloor_ros.core.contracts import KeyframePath, Mount
 from segfloor_ros.core.files.whole import user_path
 from segfloor_ros.core.plugins.semantics.label_map import LabelMap, numbered
 from segfloor_ros.core.plugins.semantics.network import ImageLabeller, NetworkSettings
-from segfloor_ros.nodes.configuration import SegfloorMasksNodeSettings
-from segfloor_ros.nodes.messages.arrays import (
-    colour8_image,
-    depth_image,
-    features_arrays,
-    grey8_image,
-    grid_message,
-    grid_of,
-    image_message,
-    scan_arrays,
-)
+from segfloor_ros.nodes.messages.colours import colour8_image
 from segfloor_ros.nodes.messages.diagnostics import Level
+from segfloor_ros.nodes.messages.grids import grid_message, grid_of
+from segfloor_ros.nodes.messages.images import depth_image, grey8_image, image_message
+from segfloor_ros.nodes.messages.points import features_arrays
 from segfloor_ros.nodes.messages.poses import path_arrays, transform_array
+from segfloor_ros.nodes.messages.scans import scan_arrays
 from segfloor_ros.nodes.messages.topics import (
     IMAGES,
     KEYFRAME_PARTS,
@@ -39,6 +33,7 @@ from segfloor_ros.nodes.messages.topics import (
     to_ns,
 )
 from segfloor_ros.nodes.network_files import open_network
+from segfloor_ros.nodes.settings.masks import SegfloorMasksNodeSettings
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
 

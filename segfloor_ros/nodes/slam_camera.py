@@ -18,21 +18,16 @@ from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo
 
-from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration, StereoRectifier
-from segfloor_ros.core.camera.images import (
-    EightBitScale,
-    depth_calibration,
-    depth_image,
-    disparity_of_depth,
-    eye_calibration,
-    grey_image,
-)
+from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration, eye_calibration
+from segfloor_ros.core.camera.depth import depth_calibration, disparity_of_depth
+from segfloor_ros.core.camera.images import EightBitScale, depth_image, grey_image
+from segfloor_ros.core.camera.rectification import StereoRectifier
 from segfloor_ros.core.contracts import InputFault, Mount
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.nodes.configuration import StereoSlamNodeSettings
-from segfloor_ros.nodes.messages.arrays import same_calibration
+from segfloor_ros.nodes.messages.camera_infos import same_calibration
 from segfloor_ros.nodes.messages.diagnostics import LASTS_S, RECENT, Level
 from segfloor_ros.nodes.messages.topics import IMAGES, KEYFRAMES, PATIENCE_S, best_effort
+from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import DISCOVERY_S
 from segfloor_ros.nodes.shared.reporter import offered_best_effort
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode

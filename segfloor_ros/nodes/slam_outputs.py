@@ -24,25 +24,17 @@ from segfloor_ros.core.camera.pixels import Region, shrink_factor, shrunk_camera
 from segfloor_ros.core.contracts import FrameResult, Keyframe, LoadedMap, Mount, StereoFrame
 from segfloor_ros.core.errors import MapError, SegfloorError, SettingsError
 from segfloor_ros.core.files.arrays import MapFile
-from segfloor_ros.core.files.results import SAVED_MAP, read_map_file, write_map_file
 from segfloor_ros.core.files.whole import user_path
-from segfloor_ros.core.files.writing import check_output
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.plugins.maps.pruning import prune_file
-from segfloor_ros.core.plugins.maps.saved_slam import save_slam
 from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
-from segfloor_ros.nodes.configuration import StereoSlamNodeSettings
-from segfloor_ros.nodes.messages import arrays, poses
-from segfloor_ros.nodes.messages.arrays import (
-    camera_info_message,
-    image_message,
-    map_file_message,
-    map_file_of,
-    map_start_message,
-    rectified_calibration,
-)
+from segfloor_ros.nodes.messages import odometry as odometry_messages
+from segfloor_ros.nodes.messages import points, poses
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART, Level
+from segfloor_ros.nodes.messages.images import image_message
+from segfloor_ros.nodes.messages.map_starts import map_start_message
+from segfloor_ros.nodes.messages.saved_maps import map_file_message, map_file_of
 from segfloor_ros.nodes.messages.topics import (
     CORRECTED,
     FRAME_PARTS,
@@ -56,6 +48,7 @@ from segfloor_ros.nodes.messages.topics import (
     SIDES,
     make_header,
 )
+from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import LEAST_PERIOD_S, LOOK_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
@@ -117,7 +110,7 @@ class SlamTopics:
             self._publish_pose(result)
         if result.moving is not None:
             frame_id = self._own.map_frame
-            message = arrays.moving_points_message(result.stamp_ns, frame_id, result.moving)
+            message = points.moving_points_message(result.stamp_ns, frame_id, result.moving)
             self._out.publish('moving_points', message)
         if result.keyframe is not None:
             self._publish_keyframe(result, result.keyframe)
@@ -164,21 +157,23 @@ class SlamTopics:
 
     def _publish_odometry(self, result: FrameResult, suffix: str) -> None:
         last, twist, of_twist = self._last, None, None
-        covariance = poses.never_certain(result.covariance)
+        covariance = odometry_messages.never_certain(result.covariance)
         if last is not None and last.tracked and result.stamp_ns > last.stamp_ns:
             duration_s = (result.stamp_ns - last.stamp_ns) * 1e-9
-            twist = poses.body_twist(last.T_odom_base, result.T_odom_base, duration_s)
-            before = poses.never_certain(last.covariance)
-            of_twist = poses.twist_covariance(before, result.T_odom_base, covariance, duration_s)
+            twist = odometry_messages.body_twist(last.T_odom_base, result.T_odom_base, duration_s)
+            before = odometry_messages.never_certain(last.covariance)
+            of_twist = odometry_messages.twist_covariance(
+                before, result.T_odom_base, covariance, duration_s
+            )
         own = self._own
         if self._out.listeners('pose' + suffix):
             T_map_base = result.T_map_odom @ result.T_odom_base
             at = result.stamp_ns, own.map_frame
-            in_map = poses.never_certain(result.covariance_in_map)
-            message = poses.pose_with_covariance_message(*at, T_map_base, in_map)
+            in_map = odometry_messages.never_certain(result.covariance_in_map)
+            message = odometry_messages.pose_with_covariance_message(*at, T_map_base, in_map)
             self._out.publish('pose' + suffix, message)
         at, T_odom_base = (result.stamp_ns, own.odom_frame), result.T_odom_base
-        odometry = poses.odometry_message(
+        odometry = odometry_messages.odometry_message(
             *at, own.base_frame, T_odom_base, covariance, twist, of_twist
         )
         self._out.publish('odometry' + suffix, odometry)
@@ -188,10 +183,10 @@ class SlamTopics:
             T_map_base, moving = keyframe.T_map_base, keyframe.moving
             self._publish_view(result, keyframe.left, keyframe.right, moving, T_map_base)
         out, at = self._out, (keyframe.stamp_ns, self._own.map_frame)
-        out.publish('keyframe/features', arrays.features_message(*at, keyframe.features))
+        out.publish('keyframe/features', points.features_message(*at, keyframe.features))
         path = self._path_messages.next(keyframe.stamp_ns, keyframe.path)
         out.publish('keyframe/path', path)
-        out.publish('map_points', arrays.sparse_cloud_message(*at, keyframe.cloud))
+        out.publish('map_points', points.sparse_cloud_message(*at, keyframe.cloud))
 
     def _publish_view(
         self,
@@ -209,8 +204,8 @@ class SlamTopics:
         self._publish_pair(KEYFRAME_PARTS, stamp_ns, (left, right), self._calibration)
         moving = np.zeros_like(left) if moving is None else moving
         out.publish(MOVING_MASK, image_message(stamp_ns, self.frames.left, moving))
-        covariance = poses.never_certain(result.covariance_in_map)
-        pose = poses.odometry_message(*at, own.base_frame, T_map_base, covariance)
+        covariance = odometry_messages.never_certain(result.covariance_in_map)
+        pose = odometry_messages.odometry_message(*at, own.base_frame, T_map_base, covariance)
         out.publish('keyframe/odometry', pose)
         out.publish(MAP_START, map_start_message(*at, self.map_start_ns, self._is_loaded))
 
@@ -332,7 +327,7 @@ class SlamResults:
         # Frames before it was certain come later.
         since_ns = min(self._in_map_since_ns or result.stamp_ns, result.stamp_ns)
         self._in_map_since_ns = since_ns
-        sigmas = np.sqrt(np.diag(poses.never_certain(result.covariance_in_map)))
+        sigmas = np.sqrt(np.diag(odometry_messages.never_certain(result.covariance_in_map)))
         return {
             'in_map_s': f'{1e-9 * (result.stamp_ns - since_ns):.2f}',
             'place_sigma_m': f'{sigmas[:3].max():.4f}',
@@ -388,7 +383,11 @@ class SlamMaps:
     def read(self) -> MapFile | None:
         """Return the map of the parameter `load_map`, None where it is empty. Raises InputError."""
         self.loaded, name = None, self._own.load_map
-        return read_map_file(user_path(name)) if name else None
+        if not name:
+            return None
+        from segfloor_ros.core.files.results import read_map_file
+
+        return read_map_file(user_path(name))
 
     def keep(self, slam: StereoSlam) -> None:
         """Keep what a later life of this node goes on from, where there are new keyframes."""
@@ -421,6 +420,8 @@ class SlamMaps:
         slam = self._slam()
         if slam is None:
             raise MapError('there is no map yet that could be saved')
+        from segfloor_ros.core.plugins.maps.saved_slam import save_slam
+
         saved = save_slam(slam, slam.rig.camera)
         saved.header['start_ns'] = self._topics.map_start_ns
         return saved
@@ -451,6 +452,8 @@ class SlamMaps:
 
     async def _prune(self) -> str:
         """Prune the file of `save_map` beside tracking; the map in use stays as it is."""
+        from segfloor_ros.core.plugins.maps.pruning import prune_file
+
         said: list[str] = []
         path = self._file_to_save()
         await _in_background(lambda: said.append(prune_file(path)))
@@ -484,6 +487,9 @@ class SlamMaps:
 
     def _begin_to_save(self) -> tuple[Path, MapFile]:
         """Ask for the parts of the other nodes; returns where to save, and SLAM's own part."""
+        from segfloor_ros.core.files.results import SAVED_MAP
+        from segfloor_ros.core.files.writing import check_output
+
         path = self._file_to_save()
         check_output(path, SAVED_MAP, (self._own.load_map,), 'save_map')
         saved = self._slam_part()
@@ -503,6 +509,8 @@ class SlamMaps:
                 if part.header['start_ns'] != start_ns:
                     raise MapError('the map was reset while it was saved')
                 saved.parts |= part.parts
+            from segfloor_ros.core.files.results import write_map_file
+
             inputs = (self._own.load_map,)
             await _in_background(partial(write_map_file, path, saved, inputs))
         finally:

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image, Imu
 
-from segfloor_ros.core.camera.calibration import StereoRectifier
-from segfloor_ros.core.camera.images import imu_sample, measures_motion, wheel_pose, xyz
+from segfloor_ros.core.camera.measurements import imu_sample, measures_motion, wheel_pose, xyz
 from segfloor_ros.core.camera.recording import is_upright
+from segfloor_ros.core.camera.rectification import StereoRectifier
 from segfloor_ros.core.contracts import Measurement, WheelPose
 from segfloor_ros.core.geometry import Array, make_transform
 from segfloor_ros.core.slam.rig import GATE, chi2_limit
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
-from segfloor_ros.nodes.messages.arrays import grey8_image
+from segfloor_ros.nodes.messages.images import grey8_image
 from segfloor_ros.nodes.messages.poses import pose_array
 from segfloor_ros.nodes.messages.topics import (
     FRESH_S,

@@ -28,18 +28,14 @@ from segfloor_ros.core.camera.recording import (
     RecordedSensor,
     StereoCameraSettings,
 )
-from segfloor_ros.core.configuration import MAX_KEYFRAMES_UNDER_WAY
-from segfloor_ros.core.contracts import Measurement, WheelPose
+from segfloor_ros.core.contracts import MAX_KEYFRAMES_UNDER_WAY, Measurement, WheelPose
 from segfloor_ros.core.errors import InputError, SegfloorError
 from segfloor_ros.core.geometry import Array, make_transform
-from segfloor_ros.nodes.configuration import StereoCameraNodeSettings, StereoSlamNodeSettings
-from segfloor_ros.nodes.messages.arrays import (
-    camera_info_message,
-    compressed_message,
-    image_message,
-)
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, compressed_message
 from segfloor_ros.nodes.messages.diagnostics import RECORDING, Level
-from segfloor_ros.nodes.messages.poses import imu_message, transform_message, wheel_message
+from segfloor_ros.nodes.messages.images import image_message
+from segfloor_ros.nodes.messages.poses import transform_message
+from segfloor_ros.nodes.messages.sensors import imu_message, wheel_message
 from segfloor_ros.nodes.messages.topics import (
     FRAMES,
     PACED_BY,
@@ -49,6 +45,8 @@ from segfloor_ros.nodes.messages.topics import (
     stamp_of,
     to_time,
 )
+from segfloor_ros.nodes.settings.camera import StereoCameraNodeSettings
+from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import LOOK_S
 from segfloor_ros.nodes.shared.stage_node import StageNode
 from segfloor_ros.nodes.shared.transforms import TfLink

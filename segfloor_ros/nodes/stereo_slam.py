@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import time
 
-from segfloor_ros.core.contracts import StereoFrame
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import Mount, StereoFrame
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.arrays import MapFile
-from segfloor_ros.core.plugins.assembly import make_slam
-from segfloor_ros.core.plugins.maps.saved_slam import (
-    last_pose_of,
-    last_pose_values,
-    load_slam,
-    saved_camera,
-)
 from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE, StereoSlam
-from segfloor_ros.nodes.configuration import StereoSlamNodeSettings
 from segfloor_ros.nodes.messages.diagnostics import Level
 from segfloor_ros.nodes.messages.topics import FRAME_DONE, make_header
+from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import CHECK_S
 from segfloor_ros.nodes.shared.joining import InTime, StampOrder
 from segfloor_ros.nodes.shared.running import run_node
@@ -65,9 +59,11 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         self._is_started = self._is_resumed = False
         self._frame_count = 0
         if saved is not None:
+            from segfloor_ros.core.plugins.maps.saved_slam import load_slam, saved_camera
+
             name, own = self.settings.load_map, self.settings
             camera = saved_camera(saved, name)
-            self.slam = make_slam(camera, own, background=own.background)
+            self.slam = self._make_slam(camera)
             self._maps.loaded = saved, load_slam(self.slam, camera, saved, name, own.localize)
 
     def reset(self, reason: str) -> None:
@@ -79,11 +75,13 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         """Go on with the map of a killed node: with its stamps, and where it ended. Raises
         InputError.
         """
+        from segfloor_ros.core.plugins.maps.saved_slam import last_pose_of, load_slam, saved_camera
+
         last = last_pose_of(saved.header.get('note', {}))
         self._end_stage()
         self._results.reset(saved.header['start_ns'])
         camera = saved_camera(saved, 'kept map')
-        self.slam = make_slam(camera, self.settings, background=self.settings.background)
+        self.slam = self._make_slam(camera)
         load_slam(self.slam, camera, saved, 'kept map', last=last)
         self._stamps = StampOrder(last.stamp_ns)
         self._is_resumed = True
@@ -204,6 +202,8 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         if self._results.mount is not None and slam.back_end.idle:
             self._maps.keep(slam)
         if slam.last_pose is not None:
+            from segfloor_ros.core.plugins.maps.saved_slam import last_pose_values
+
             self.kept_state.note(last_pose_values(slam.last_pose))
 
     def _started(self, pair: Pair) -> StereoSlam:
@@ -223,12 +223,18 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             mount = None if own.gives_mount else self._transforms.mount(frames.left)
             if own.path_only and mount is None and not own.has_mount:
                 mount = CAMERA_AS_BASE
-            self.slam = make_slam(camera, own, mount, background=own.background)
+            self.slam = self._make_slam(camera, mount)
         self.slam.announce = self._results.announce if self.settings.background else None
         self._results.topics.begin(self._camera.calibration, frames)
         self._sensors.begin(frames.left, self._camera.rectifier.calibration.left.R)
         self._is_started = True
         return self.slam
+
+    def _make_slam(self, camera: StereoCamera, mount: Mount | None = None) -> StereoSlam:
+        """Build SLAM with all that plugs in, which is loaded only now."""
+        from segfloor_ros.core.plugins.assembly import make_slam
+
+        return make_slam(camera, self.settings, mount, background=self.settings.background)
 
     def _end_stage(self) -> None:
         if self.slam is not None:

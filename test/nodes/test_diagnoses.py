@@ -21,12 +21,9 @@ from stereo_room import CAMERA, MOUNT
 from segfloor_ros.core.floor.plane.mount import MountEstimator
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.messages.arrays import (
-    camera_info_message,
-    image_message,
-    rectified_calibration,
-)
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import HEALTH, Health, Level
+from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.topics import IMAGES, TOPICS, best_effort
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 

@@ -16,8 +16,9 @@ from stereo_drive import room_drive
 
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.slam.places.views import NEW_TURN_RAD
-from segfloor_ros.nodes.messages.arrays import camera_info_message, image_message
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message
 from segfloor_ros.nodes.messages.diagnostics import Level
+from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.poses import path_arrays, pose_array
 from segfloor_ros.nodes.messages.topics import FLOOR, SLAM, TOPICS, to_ns
 

@@ -16,13 +16,13 @@ from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.messages.arrays import (
+from segfloor_ros.nodes.messages.camera_infos import (
     camera_info_message,
     compressed_message,
-    image_message,
     rectified_calibration,
 )
 from segfloor_ros.nodes.messages.diagnostics import HEALTH, Level
+from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.topics import FRAMES, IMAGES, SLAM, TOPICS, to_time
 from segfloor_ros.nodes.shared import reporter
 from segfloor_ros.nodes.shared.reporter import likeness

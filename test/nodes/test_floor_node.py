@@ -10,14 +10,10 @@ from segfloor_ros.core.floor.pictures import mask_overlay
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.messages.arrays import (
-    camera_info_message,
-    grey8_image,
-    image_message,
-    rectified_calibration,
-    scan_arrays,
-)
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
+from segfloor_ros.nodes.messages.images import grey8_image, image_message
 from segfloor_ros.nodes.messages.poses import transform_message
+from segfloor_ros.nodes.messages.scans import scan_arrays
 from segfloor_ros.nodes.messages.topics import to_ns
 
 CALIBRATION = rectified_calibration(CAMERA)

@@ -18,8 +18,7 @@ import sys
 import numpy as np
 import {node}
 from segfloor_ros.nodes.messages.poses import PathMessages, path_arrays, pose_array, pose_message
-from segfloor_ros.core.camera.model import Mount
-from segfloor_ros.core.slam.results import KeyframePath
+from segfloor_ros.core.contracts import KeyframePath, Mount
 Mount.from_transform(Mount(0.3, 0.1).T_base_left)
 pose_array(pose_message(np.eye(4)))
 path_arrays(PathMessages('map').next(1, KeyframePath(np.array([1]), np.eye(4)[None])))

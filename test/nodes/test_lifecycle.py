@@ -14,7 +14,7 @@ from stereo_drive import room_drive, write_kitti
 from segfloor_ros.apps.stereo_camera import make_stereo_camera
 from segfloor_ros.core.cloud import CloudLabelling, CloudLabellingSettings
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.messages.arrays import labelled_arrays
+from segfloor_ros.nodes.messages.points import labelled_arrays
 from segfloor_ros.nodes.messages.topics import NODES, published_by, subscribed_by, to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 

@@ -16,12 +16,9 @@ from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.messages.arrays import (
-    camera_info_message,
-    image_message,
-    rectified_calibration,
-)
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import HEALTH, LASTS_S, Level
+from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.topics import KEYFRAMES
 from segfloor_ros.nodes.shared.reporter import LossCounter, loss_in_words
 from segfloor_ros.nodes.slam_camera import PairQueue

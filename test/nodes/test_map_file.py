@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 import yaml
 
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from segfloor_ros.nodes.map_files import load_map, save_map
+from segfloor_ros.nodes.map_files import save_map
 
 # Three rows, four columns, no symmetry: a transposed, flipped or turned copy differs.
 CELLS = np.array([[0, 100, 0, -1], [100, 0, 0, 0], [-1, -1, 100, 0]], np.int8)

@@ -14,29 +14,23 @@ from segfloor_ros.apps.cli.explore_session import Pilot
 from segfloor_ros.apps.cli.replay_recorder import DriveNotes
 from segfloor_ros.apps.evaluation.exploration import Exploration
 from segfloor_ros.apps.navigation import Body, Explorer
-from segfloor_ros.core.camera.calibration import StereoRectifier
+from segfloor_ros.core.camera.rectification import StereoRectifier
 from segfloor_ros.core.contracts import FLOOR, MovingPoints, SparseCloud
 from segfloor_ros.core.slam.tracking.images import is_inside
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.messages.arrays import (
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
+from segfloor_ros.nodes.messages.diagnostics import Level, Status
+from segfloor_ros.nodes.messages.images import grey8_image, image_message
+from segfloor_ros.nodes.messages.odometry import odometry_message, pose_with_covariance_message
+from segfloor_ros.nodes.messages.points import (
     FEATURE_DTYPE,
     MOVING_DTYPE,
-    camera_info_message,
     cloud_array,
-    free_scan_message,
-    grey8_image,
-    image_message,
     moving_points_message,
-    obstacle_scan_message,
-    rectified_calibration,
     sparse_cloud_message,
 )
-from segfloor_ros.nodes.messages.diagnostics import Level, Status
-from segfloor_ros.nodes.messages.poses import (
-    odometry_message,
-    pose_with_covariance_message,
-    transform_message,
-)
+from segfloor_ros.nodes.messages.poses import transform_message
+from segfloor_ros.nodes.messages.scans import free_scan_message, obstacle_scan_message
 from segfloor_ros.nodes.messages.topics import to_ns
 from segfloor_ros.nodes.slam_sensors import MaskInput
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode

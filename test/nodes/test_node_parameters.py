@@ -9,13 +9,10 @@ from rclpy.parameter import Parameter
 
 from segfloor_ros.core.errors import SettingsError
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.configuration import (
-    NODE_SETTINGS,
-    STAGE_SETTINGS,
-    CloudLabellingNodeSettings,
-)
+from segfloor_ros.nodes.configuration import NODE_SETTINGS, STAGE_SETTINGS
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
+from segfloor_ros.nodes.settings.cloud import CloudLabellingNodeSettings
 from segfloor_ros.nodes.shared.running import command_line_parameters
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 

@@ -14,7 +14,7 @@ from ros_graph import fresh_graph
 from std_srvs.srv import SetBool, Trigger
 from stereo_drive import lockstep_map, room_drive, write_kitti
 
-from segfloor_ros.nodes.map_files import load_map
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.nodes.messages.topics import CAMERA, GRID, NODES, SLAM, published_by, to_ns
 
 FRAMES = 14

@@ -20,10 +20,10 @@ from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.apps.cli.main import main
 from segfloor_ros.apps.cli.replay_nodes import unconnected
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.trajectory import read_trajectory
 from segfloor_ros.core.files.results import read_map_file
 from segfloor_ros.core.grid.occupancy import FREE
-from segfloor_ros.nodes.map_files import load_map
 from segfloor_ros.nodes.messages.topics import NODES, published_by
 
 FRAMES, DAMAGED = 20, 7

@@ -19,14 +19,10 @@ from segfloor_ros.core.plugins.assembly import make_pipeline
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.configuration import resolve
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.messages.arrays import (
-    camera_info_message,
-    image_message,
-    labelled_arrays,
-    map_start_message,
-    map_start_ns,
-    rectified_calibration,
-)
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
+from segfloor_ros.nodes.messages.images import image_message
+from segfloor_ros.nodes.messages.map_starts import map_start_message, map_start_ns
+from segfloor_ros.nodes.messages.points import labelled_arrays
 from segfloor_ros.nodes.messages.poses import transform_array
 from segfloor_ros.nodes.messages.topics import MAP_START, TOPICS, to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode

@@ -19,11 +19,11 @@ from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.slam.places.views import NEW_TURN_RAD
-from segfloor_ros.nodes.messages.arrays import labelled_arrays
 from segfloor_ros.nodes.messages.diagnostics import Level, Status
+from segfloor_ros.nodes.messages.points import labelled_arrays
 from segfloor_ros.nodes.messages.poses import path_arrays, pose_array
 from segfloor_ros.nodes.messages.topics import CAMERA, FLOOR, GRID, SLAM, to_ns
-from segfloor_ros.nodes.shared.maps import KeptState
+from segfloor_ros.nodes.shared.kept_state import KeptState
 
 NEW_VIEW_RAD = 1.1 * NEW_TURN_RAD
 """Turn per frame: every one is a new view, which becomes a keyframe."""

@@ -23,11 +23,8 @@ from segfloor_ros.core.files.results import read_map_file
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.messages.arrays import (
-    camera_info_message,
-    image_message,
-    rectified_calibration,
-)
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
+from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.poses import pose_array, pose_message
 from segfloor_ros.nodes.messages.topics import to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode

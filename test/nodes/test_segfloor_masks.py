@@ -24,18 +24,12 @@ from segfloor_ros.core.contracts import (
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.grid.occupancy import FREE, UNKNOWN, OccupancyGrid
 from segfloor_ros.core.slam.tracking.images import is_inside
-from segfloor_ros.nodes.messages.arrays import (
-    camera_info_message,
-    disparity_message,
-    features_message,
-    grey8_image,
-    grid_message,
-    grid_of,
-    image_message,
-    rectified_calibration,
-    scan_message,
-)
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
+from segfloor_ros.nodes.messages.grids import grid_message, grid_of
+from segfloor_ros.nodes.messages.images import disparity_message, grey8_image, image_message
+from segfloor_ros.nodes.messages.points import features_message
 from segfloor_ros.nodes.messages.poses import PathMessages, transform_message
+from segfloor_ros.nodes.messages.scans import scan_message
 from segfloor_ros.nodes.messages.topics import to_ns
 from segfloor_ros.nodes.segfloor_masks import SegfloorMasksNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode

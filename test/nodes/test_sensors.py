@@ -14,20 +14,16 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT, depth_of_room
 
 from segfloor_ros.apps.stereo_camera import make_stereo_camera
-from segfloor_ros.core.camera.images import imu_sample, wheel_pose
+from segfloor_ros.core.camera.measurements import imu_sample, wheel_pose
 from segfloor_ros.core.contracts import ImuSample, StereoFrame, WheelPose
 from segfloor_ros.core.geometry import invert, make_transform
 from segfloor_ros.core.quaternions import quaternion_xyzw
 from segfloor_ros.nodes import slam_camera
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.messages.arrays import grey8_image, right_image
-from segfloor_ros.nodes.messages.poses import (
-    imu_message,
-    pose_array,
-    transform_message,
-    wheel_message,
-)
+from segfloor_ros.nodes.messages.images import grey8_image, right_image
+from segfloor_ros.nodes.messages.poses import pose_array, transform_message
+from segfloor_ros.nodes.messages.sensors import imu_message, wheel_message
 from segfloor_ros.nodes.messages.topics import KEYFRAMES, to_ns
 from segfloor_ros.nodes.shared.inputs import LOOK_S
 from segfloor_ros.nodes.slam_sensors import SensorInput

@@ -26,8 +26,9 @@ from std_srvs.srv import SetBool, Trigger
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
 
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.stereo_camera import make_stereo_camera
-from segfloor_ros.core.camera.images import eye_calibration
+from segfloor_ros.core.camera.calibration import eye_calibration
 from segfloor_ros.core.cloud import CloudLabelling, CloudLabellingSettings
 from segfloor_ros.core.contracts import (
     POINT_FLOOR,
@@ -43,19 +44,19 @@ from segfloor_ros.core.grid.mapper import OccupancyGridMapper
 from segfloor_ros.core.grid.occupancy import OccupancyGridSettings
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.map_files import load_map
-from segfloor_ros.nodes.messages.arrays import (
+from segfloor_ros.nodes.messages.camera_infos import (
     camera_info_message,
     compressed_message,
-    features_message,
-    grey8_image,
-    image_message,
-    labelled_arrays,
     rectified_calibration,
+)
+from segfloor_ros.nodes.messages.diagnostics import Level, Status
+from segfloor_ros.nodes.messages.images import grey8_image, image_message
+from segfloor_ros.nodes.messages.points import (
+    features_message,
+    labelled_arrays,
     sparse_cloud_arrays,
     sparse_cloud_message,
 )
-from segfloor_ros.nodes.messages.diagnostics import Level, Status
 from segfloor_ros.nodes.messages.poses import (
     path_arrays,
     pose_array,

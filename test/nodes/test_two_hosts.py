@@ -13,9 +13,9 @@ import pytest
 import thin_link
 from stereo_drive import lockstep_map, room_drive, write_kitti
 
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.programs import program_of
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.nodes.map_files import load_map
 from segfloor_ros.nodes.messages.topics import CAMERA, FLOOR, NODES, SLAM
 
 TEST = Path(__file__).resolve().parents[1]

@@ -8,11 +8,11 @@ import cv2
 import pytest
 from rich.console import Console
 
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.simulation.scene_file import open_scene, shipped
 from segfloor_ros.apps.simulation.world import RenderingError
 from segfloor_ros.core.errors import SettingsError
 from segfloor_ros.nodes.configuration import resolve
-from segfloor_ros.nodes.map_files import load_map
 from tools.benchmark_published import as_document, published_table, run_scene
 from tools.published_figures import PUBLISHED, parse_scenes
 

@@ -21,13 +21,13 @@ from segfloor_ros.apps.cli.view import open_view
 from segfloor_ros.apps.evaluation.map_score import compare, overlay_png, score_map
 from segfloor_ros.apps.evaluation.maps import load_truth
 from segfloor_ros.apps.lockstep import LockstepRun, SaveMasks
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.results_folder import OutputFolder
 from segfloor_ros.core.errors import MapError, SettingsError, about
 from segfloor_ros.core.files.writing import add_files
 from segfloor_ros.core.processes import Interrupt, first_interrupt_noted
-from segfloor_ros.nodes.configuration import StereoCameraNodeSettings
-from segfloor_ros.nodes.map_files import load_map
 from segfloor_ros.nodes.network_files import open_network
+from segfloor_ros.nodes.settings.camera import StereoCameraNodeSettings
 from segfloor_ros.nodes.yaml_files import read_yaml
 
 DRIVE = Path(str(resources.files('segfloor_ros.apps.simulation') / 'demo'))

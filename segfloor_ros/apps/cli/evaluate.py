@@ -53,6 +53,7 @@ from segfloor_ros.apps.evaluation.maps import (
     load_truth,
     read_base_poses,
 )
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.trajectory import FARTHEST, TUM_COLUMNS
 from segfloor_ros.core.configuration import Configuration
@@ -62,7 +63,6 @@ from segfloor_ros.core.files.writing import PNG, check_output, marked_png, write
 from segfloor_ros.core.geometry import Pose2d
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.nodes.configuration import resolve
-from segfloor_ros.nodes.map_files import load_map
 
 DEFAULT = BenchmarkPlan()
 

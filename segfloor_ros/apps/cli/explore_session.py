@@ -51,14 +51,11 @@ from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.processes import Interrupt, first_interrupt_noted
 from segfloor_ros.nodes.configuration import resolve
 from segfloor_ros.nodes.map_files import save_map
-from segfloor_ros.nodes.messages.arrays import (
-    grey8_image,
-    grid_of,
-    moving_points_arrays,
-    scan_arrays,
-    sparse_cloud_arrays,
-)
+from segfloor_ros.nodes.messages.grids import grid_of
+from segfloor_ros.nodes.messages.images import grey8_image
+from segfloor_ros.nodes.messages.points import moving_points_arrays, sparse_cloud_arrays
 from segfloor_ros.nodes.messages.poses import pose_array
+from segfloor_ros.nodes.messages.scans import scan_arrays
 from segfloor_ros.nodes.messages.topics import (
     CAMERA,
     GRID,

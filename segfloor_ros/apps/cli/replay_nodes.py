@@ -30,8 +30,9 @@ from segfloor_ros.apps.programs import program_of
 from segfloor_ros.core.errors import MapError, SegfloorError
 from segfloor_ros.core.files.writing import scratch_folder
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.core.processes import end_with_parent, how_it_ended, interrupts_deferred, rss_mb
-from segfloor_ros.nodes.messages.arrays import grid_of
+from segfloor_ros.core.memory import rss_mb
+from segfloor_ros.core.processes import end_with_parent, how_it_ended, interrupts_deferred
+from segfloor_ros.nodes.messages.grids import grid_of
 from segfloor_ros.nodes.messages.topics import (
     DIAGNOSTICS,
     GRID,

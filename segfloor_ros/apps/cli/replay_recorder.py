@@ -29,14 +29,11 @@ from segfloor_ros.core.contracts import KeyframePath, Mount
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.timing import StageTimes
 from segfloor_ros.nodes.messages import diagnostics
-from segfloor_ros.nodes.messages.arrays import (
-    bgr_image,
-    grey8_image,
-    grid_of,
-    labelled_arrays,
-    moving_points_arrays,
-)
+from segfloor_ros.nodes.messages.colours import bgr_image
 from segfloor_ros.nodes.messages.diagnostics import Level, Status
+from segfloor_ros.nodes.messages.grids import grid_of
+from segfloor_ros.nodes.messages.images import grey8_image
+from segfloor_ros.nodes.messages.points import labelled_arrays, moving_points_arrays
 from segfloor_ros.nodes.messages.poses import path_arrays, pose_array, transform_array
 from segfloor_ros.nodes.messages.topics import (
     CAMERA,

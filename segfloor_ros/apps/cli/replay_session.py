@@ -32,6 +32,7 @@ from segfloor_ros.apps.cli.replay_recorder import POINTS, MaskListener, ReplayRe
 from segfloor_ros.apps.cli.view import View
 from segfloor_ros.apps.label_files import labels_of
 from segfloor_ros.apps.lockstep import NO_MAPS, MapOptions, ProgressListener, no_floor
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.results_folder import RunResult, summarise
 from segfloor_ros.apps.trajectory import Trajectory, corrected_trajectory
 from segfloor_ros.core.camera.recording import DEPTH, SENSORS
@@ -41,11 +42,12 @@ from segfloor_ros.core.contracts import KeyframePath, LabelledPoints
 from segfloor_ros.core.errors import InputError, MapError, SegfloorError
 from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
+from segfloor_ros.core.memory import rss_mb
 from segfloor_ros.core.plugins.maps.saved_slam import loaded_map, new_keyframes
-from segfloor_ros.core.processes import Interrupt, rss_mb
-from segfloor_ros.nodes.map_files import load_map
-from segfloor_ros.nodes.messages.arrays import grid_of, labelled_arrays, sparse_cloud_arrays
+from segfloor_ros.core.processes import Interrupt
 from segfloor_ros.nodes.messages.diagnostics import HEALTH_PERIOD_S, Level, Status
+from segfloor_ros.nodes.messages.grids import grid_of
+from segfloor_ros.nodes.messages.points import labelled_arrays, sparse_cloud_arrays
 from segfloor_ros.nodes.messages.topics import CAMERA, GRID, MASKS, NODES, SLAM
 from segfloor_ros.nodes.network_files import read_network_settings
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.apps.cli.terminal import console, progress_bar
 from segfloor_ros.apps.label_files import class_colours, draw_labels
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.ply import read_ply
 from segfloor_ros.apps.recordings import StereoSource, open_source
 from segfloor_ros.apps.results_folder import (
@@ -55,7 +56,6 @@ from segfloor_ros.core.grid.occupancy import UNKNOWN_PIXEL, OccupancyGrid
 from segfloor_ros.core.pipeline import Pipeline
 from segfloor_ros.core.plugins.semantics.outputs import UNLABELLED
 from segfloor_ros.nodes.configuration import resolve
-from segfloor_ros.nodes.map_files import load_map
 
 SUFFIX = '.rrd'
 

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.trajectory import read_trajectory
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.whole import read_table
 from segfloor_ros.core.geometry import Array, Pose2d, planar
 from segfloor_ros.core.grid.occupancy import FINE, FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from segfloor_ros.nodes.map_files import load_map
 from segfloor_ros.nodes.yaml_files import read_yaml
 
 BEARINGS = 361

@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 
 from segfloor_ros.apps.calibration import CalibrationResult, eight_bit, rectified_pixels
 from segfloor_ros.apps.evaluation.maps import MapTruth, load_truth, thinned
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.ply import read_ply
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.results_folder import MOUNT_FIGURES, read_summary
 from segfloor_ros.apps.trajectory import read_trajectory
-from segfloor_ros.core.camera.calibration import StereoRectifier
 from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.rectification import StereoRectifier
 from segfloor_ros.core.contracts import (
     CELL_M,
     POINT_FLOOR,
@@ -49,7 +50,6 @@ from segfloor_ros.core.grid.occupancy import (
     OccupancyGrid,
 )
 from segfloor_ros.nodes.configuration import resolve
-from segfloor_ros.nodes.map_files import load_map
 
 FLOOR, NO_EVIDENCE = '#3aa655', f'{UNKNOWN_PIXEL / 255}'
 """Of points; what nothing is known of has the grey that it has in a map."""

@@ -24,15 +24,10 @@ from segfloor_ros.apps.recordings.files import (
     rate_of,
 )
 from segfloor_ros.apps.recordings.source import PairEntry, StampPairing, StereoSource
-from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.core.camera.images import (
-    Grey,
-    colour_image,
-    depth_calibration,
-    depth_image,
-    disparity_of_depth,
-    eye_calibration,
-    grey_image,
+from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration, eye_calibration
+from segfloor_ros.core.camera.depth import depth_calibration, disparity_of_depth
+from segfloor_ros.core.camera.images import Grey, colour_image, depth_image, grey_image
+from segfloor_ros.core.camera.measurements import (
     imu_sample,
     measures_motion,
     rigid_motion,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from segfloor_ros.apps.recordings.bag_file import CAMERA_INFO, COMPRESSED, IMAGE, MISSING_LIBRARY
 from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.core.camera.images import NOT_MEASURED
+from segfloor_ros.core.camera.measurements import NOT_MEASURED
 from segfloor_ros.core.camera.model import is_disparity
 from segfloor_ros.core.camera.recording import IMU_FRAME, MeasurementLog, RawPair
 from segfloor_ros.core.contracts import ImuSample, Measurement, WheelPose

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from segfloor_ros.apps.recordings.extrinsics import calibration_from_extrinsics
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.recording import StereoCameraSettings
 from segfloor_ros.core.errors import CalibrationError
@@ -160,7 +161,7 @@ def _from_euroc(
     for path, document in ((left, left_document), (right, right_document)):
         eyes.append(_euroc_eye(document, str(path)))
         poses.append(_body_pose(document, path))
-    return StereoCalibration.from_extrinsics(eyes[0], eyes[1], invert(poses[1]) @ poses[0])
+    return calibration_from_extrinsics(eyes[0], eyes[1], invert(poses[1]) @ poses[0])
 
 
 def _from_kalibr(path: Path, document: Mapping[str, Any]) -> StereoCalibration:
@@ -172,7 +173,7 @@ def _from_kalibr(path: Path, document: Mapping[str, Any]) -> StereoCalibration:
         raise CalibrationError(f'{path}, cam1: T_cn_cnm1 is missing; calibrate both cameras in one')
     T_right_left = _matrix(right['T_cn_cnm1'], 16, f'{path}, T_cn_cnm1').reshape(4, 4)
     eyes = _euroc_eye(left, f'{path}, cam0'), _euroc_eye(right, f'{path}, cam1')
-    return StereoCalibration.from_extrinsics(*eyes, T_right_left)
+    return calibration_from_extrinsics(*eyes, T_right_left)
 
 
 def _kalibr_camera(path: Path, document: Mapping[str, Any], name: str) -> Mapping[str, Any]:

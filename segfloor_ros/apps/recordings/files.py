@@ -23,10 +23,11 @@ from segfloor_ros.apps.recordings.source import (
     check_forward,
 )
 from segfloor_ros.core.camera.calibration import StereoCalibration
+from segfloor_ros.core.camera.pixels import Grey
 from segfloor_ros.core.camera.recording import DEPTH, RecordedSensor
 from segfloor_ros.core.contracts import ImuSample, Measurement, WheelPose
-from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.files.images import CorruptImageError, Grey, read_colour, read_grey
+from segfloor_ros.core.errors import CorruptImageError, InputError
+from segfloor_ros.core.files.images import read_colour, read_grey
 from segfloor_ros.core.files.whole import nanoseconds, number, read_lines, whole_nanoseconds
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.quaternions import rotations_of

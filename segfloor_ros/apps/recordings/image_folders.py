@@ -38,7 +38,7 @@ from segfloor_ros.apps.recordings.files import (
 )
 from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.core.camera.images import depth_calibration, disparity_of_depth
+from segfloor_ros.core.camera.depth import depth_calibration, disparity_of_depth
 from segfloor_ros.core.camera.recording import DEPTH, RecordedSensor, StereoCameraSettings
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.images import read_depth

@@ -17,13 +17,15 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.calibration import StereoCalibration, StereoRectifier
+from segfloor_ros.core.camera.calibration import StereoCalibration
 from segfloor_ros.core.camera.images import EightBitScale, to_grey
 from segfloor_ros.core.camera.model import StereoCamera, is_disparity
+from segfloor_ros.core.camera.pixels import Grey
 from segfloor_ros.core.camera.recording import DEPTH, RawPair, RecordedSensor
+from segfloor_ros.core.camera.rectification import StereoRectifier
 from segfloor_ros.core.contracts import StereoFrame
-from segfloor_ros.core.errors import CalibrationError, InputError
-from segfloor_ros.core.files.images import CorruptImageError, Grey, check_same_size, read_mask
+from segfloor_ros.core.errors import CalibrationError, CorruptImageError, InputError
+from segfloor_ros.core.files.images import check_same_size, read_mask
 from segfloor_ros.nodes.shared.joining import AGREEING, InTime, Stamped, StampJoiner, StampOrder
 
 PLAUSIBLE_HZ = 0.1, 1000.0

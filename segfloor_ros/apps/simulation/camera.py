@@ -16,8 +16,9 @@ from scipy.ndimage import affine_transform
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros import MAX_PIXELS
+from segfloor_ros.apps.recordings.extrinsics import FISHEYE_RESOLUTION
 from segfloor_ros.apps.simulation.scene import CameraRig, DepthSensor, Scene
-from segfloor_ros.core.camera.calibration import FISHEYE_RESOLUTION, EyeCalibration
+from segfloor_ros.core.camera.calibration import EyeCalibration
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.camera.pixels import SAME_SURFACE_SHARE
 from segfloor_ros.core.errors import InputError

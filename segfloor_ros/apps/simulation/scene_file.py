@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.navigation import Ways, graph_of
 from segfloor_ros.apps.simulation import scene as scene_module
 from segfloor_ros.apps.simulation.scene import Scene, Wall
@@ -28,7 +29,6 @@ from segfloor_ros.core.files.whole import shortened
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, Cells, OccupancyGrid
 from segfloor_ros.core.settings import suggestion
-from segfloor_ros.nodes.map_files import load_map
 from segfloor_ros.nodes.yaml_files import read_yaml, yaml_value
 
 EXPECTED = 'names and values, e.g. `walls:`'

@@ -16,15 +16,12 @@ from rosgraph_msgs.msg import Clock
 from segfloor_ros.apps.simulation.robot import DrivenRobot, open_robot
 from segfloor_ros.apps.simulation.scene_file import open_scene
 from segfloor_ros.apps.simulation.simulation import SimulatedFrame, Simulation
-from segfloor_ros.nodes.configuration import SimulatedRobotNodeSettings
-from segfloor_ros.nodes.messages.arrays import camera_info_message, image_message
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message
 from segfloor_ros.nodes.messages.diagnostics import Level
-from segfloor_ros.nodes.messages.poses import (
-    imu_message,
-    odometry_message,
-    transform_message,
-    wheel_message,
-)
+from segfloor_ros.nodes.messages.images import image_message
+from segfloor_ros.nodes.messages.odometry import odometry_message
+from segfloor_ros.nodes.messages.poses import transform_message
+from segfloor_ros.nodes.messages.sensors import imu_message, wheel_message
 from segfloor_ros.nodes.messages.topics import (
     FRAMES,
     ROBOT,
@@ -35,6 +32,7 @@ from segfloor_ros.nodes.messages.topics import (
     stamp_of,
     to_time,
 )
+from segfloor_ros.nodes.settings.robot import SimulatedRobotNodeSettings
 from segfloor_ros.nodes.shared.inputs import LOOK_S
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode

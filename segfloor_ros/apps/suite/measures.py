@@ -14,6 +14,7 @@ import numpy as np
 from segfloor_ros.apps.evaluation.floor import score_floor_folders
 from segfloor_ros.apps.evaluation.map_score import score_map
 from segfloor_ros.apps.evaluation.maps import load_truth, resample
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.results_folder import read_summary
 from segfloor_ros.apps.trajectory import read_trajectory
 from segfloor_ros.core.errors import InputError
@@ -22,7 +23,6 @@ from segfloor_ros.core.files.whole import read_json
 from segfloor_ros.core.files.writing import Kind, write_output
 from segfloor_ros.core.geometry import Pose2d
 from segfloor_ros.core.grid.occupancy import UNKNOWN, OccupancyGrid
-from segfloor_ros.nodes.map_files import load_map
 
 HIGHER, LOWER, NEITHER = 'higher', 'lower', 'neither'
 

@@ -16,13 +16,13 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from segfloor_ros.core.camera.model import StereoCamera, is_disparity
-from segfloor_ros.core.errors import CalibrationError
-from segfloor_ros.core.geometry import Array, invert
+from segfloor_ros import MAX_PIXELS
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.errors import CalibrationError, InputError
+from segfloor_ros.core.geometry import Array
 
 COEFFICIENTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14), 'equidistant': (4,)}
 """Number of distortion coefficients by model (REP-104 names)."""
@@ -39,22 +39,6 @@ MODEL_ALIASES = {
 
 SAME_PX = 1e-3
 """Intrinsics that differ by less than this are the same."""
-
-FISHEYE_RESOLUTION = 0.7
-"""So much of a fisheye's resolution its rectified view keeps in the middle. A plane cannot have all
-of it and the borders, too: this leaves 125 degrees of an image of two radians and a half.
-"""
-
-Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]
-
-_BLOCK_PX = 8
-_QUIET_GREY = 3
-_SIGNIFICANT_GREY = 8
-"""Larger steps are edges of things, wherever they are."""
-_MIN_RATIO, _MIN_PIXELS = 1.5, 200
-"""A grid is where steps across it are so many times as large, over so many pixels."""
-_MAX_STEP_GREY = 16.0
-"""Larger steps at the grid are left alone, too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,18 +154,6 @@ class EyeCalibration:
             )
 
 
-def _fisheye_projections(
-    left: EyeCalibration, right: EyeCalibration, baseline_m: float
-) -> tuple[Array, Array]:
-    """Return the projections (3, 4) of the rectified views of two fisheyes."""
-    f = FISHEYE_RESOLUTION * float(np.mean([eye.K[i, i] for eye in (left, right) for i in (0, 1)]))
-    middle = (left.width - 1) / 2, (left.height - 1) / 2
-    P = np.array([[f, 0.0, middle[0], 0.0], [0.0, f, middle[1], 0.0], [0.0, 0.0, 1.0, 0.0]])
-    shift = np.zeros((3, 4))
-    shift[0, 3] = -f * baseline_m
-    return P, P + shift
-
-
 @dataclass(frozen=True, eq=False)
 class StereoCalibration:
     """Both eyes of a stereo pair, and the rectified camera they make.
@@ -222,40 +194,6 @@ class StereoCalibration:
                 P = np.hstack([K, offset])
                 object.__setattr__(self, name, dataclasses.replace(eye, P=P))
 
-    @classmethod
-    def from_extrinsics(
-        cls, left: EyeCalibration, right: EyeCalibration, T_right_left: Array
-    ) -> StereoCalibration:
-        """Return the rectified pair of two cameras of known relative pose; their R and P are
-        replaced.
-
-        T_right_left (4, 4) maps points of the left raw optical frame into the right one. Bouguet's
-        rectification as in `cv2.stereoRectify`, cropped to the pixels both images have; of a
-        fisheye a view of `FISHEYE_RESOLUTION`, whose corners the raw images need not reach.
-        """
-        size = (left.width, left.height)
-        rotation, translation = T_right_left[:3, :3].copy(), T_right_left[:3, 3:].copy()
-        eyes = (left.K, left.D, right.K, right.D, size, rotation, translation)
-        if left.distortion_model != right.distortion_model:
-            raise CalibrationError(
-                f'{left.origin} is {left.distortion_model}, {right.origin} is '
-                f'{right.distortion_model}; both eyes need the same distortion model'
-            )
-        offset_m = invert(T_right_left)[:3, 3]
-        if offset_m[0] <= np.abs(offset_m[1:]).max():
-            x, y, z = (f'{value:g}' for value in offset_m + 0.0)
-            raise CalibrationError(
-                f'{right.origin}: the right camera is at ({x}, {y}, {z}) m in the left optical '
-                'frame, but the baseline along x must be positive and the longest: are left and '
-                'right swapped?'
-            )
-        if left.distortion_model == 'equidistant':
-            R1, R2, *_ = cv2.fisheye.stereoRectify(*eyes, cv2.CALIB_ZERO_DISPARITY)
-            P1, P2 = _fisheye_projections(left, right, float(np.linalg.norm(translation)))
-        else:
-            R1, R2, P1, P2, *_ = cv2.stereoRectify(*eyes, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0)
-        return cls(dataclasses.replace(left, R=R1, P=P1), dataclasses.replace(right, R=R2, P=P2))
-
     @property
     def is_rectified(self) -> bool:
         """Whether the raw images are the rectified ones already."""
@@ -278,140 +216,13 @@ class StereoCalibration:
             )
 
 
-class StereoRectifier:
-    """Rectifies pairs of one calibration. The maps are computed once, in fixed point (a 32nd of
-    a pixel); pairs that are rectified already keep their geometry.
+def eye_calibration(info: Any, name: str) -> EyeCalibration:
+    """Return the calibration of one eye of a CameraInfo. name: of the topic, for messages. Raises
+    CalibrationError or InputError.
     """
-
-    def __init__(self, calibration: StereoCalibration) -> None:
-        self.calibration = calibration
-        self.camera = calibration.camera
-        self._maps: tuple[Maps, Maps] | None = None
-        if not calibration.is_rectified:
-            self._maps = rectification_maps(calibration.left), rectification_maps(calibration.right)
-
-    def rectify(
-        self, left: NDArray[np.uint8], right: NDArray[Any]
-    ) -> tuple[NDArray[np.uint8], NDArray[Any]]:
-        """Return the rectified grey images (H, W) of a raw grey pair (H, W), uint8. A disparity in
-        place of the right image is aligned with the left one.
-
-        The block grid of compressed images is smoothed. Pixels that lie outside of the raw image
-        are 0. Raises CalibrationError when the size is not the calibration's.
-        """
-        for side, image in (('the left image', left), ('the right image', right)):
-            self.calibration.check_size(image.shape[1], image.shape[0], side)
-        left, right = (im if is_disparity(im) else deblocked(im) for im in (left, right))
-        if self._maps is None:
-            return left, right
-        left_maps, right_maps = self._maps
-        rectified = cv2.remap(left, *left_maps, cv2.INTER_LINEAR)
-        if is_disparity(right):
-            nan = (float('nan'),)
-            return rectified, cv2.remap(right, *left_maps, cv2.INTER_NEAREST, borderValue=nan)
-        return rectified, cv2.remap(right, *right_maps, cv2.INTER_LINEAR)
-
-    def rectify_colour(self, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the rectified left image (H, W, 3) of a raw one."""
-        if self._maps is None:
-            return left
-        return np.asarray(cv2.remap(left, *self._maps[0], cv2.INTER_LINEAR), np.uint8)
-
-    def rectify_mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return a mask (H, W) of the raw left image on the rectified one: 255 where it is more
-        than half, 0 elsewhere. Raises CalibrationError when the size is not the calibration's.
-        """
-        self.calibration.check_size(mask.shape[1], mask.shape[0], 'the mask of what moves')
-        if self._maps is not None:
-            mask = np.asarray(cv2.remap(mask, *self._maps[0], cv2.INTER_NEAREST), np.uint8)
-        return np.where(mask > 127, np.uint8(255), np.uint8(0))
-
-
-def rectification_maps(eye: EyeCalibration) -> Maps:
-    """Return where each pixel of the rectified image is in the raw one, as fixed-point maps of
-    `cv2.remap`.
-    """
-    size = (eye.width, eye.height)
-    arguments = (eye.K, eye.D, eye.R, eye.P[:, :3].copy(), size, cv2.CV_16SC2)
-    if eye.distortion_model != 'equidistant':
-        maps = cv2.initUndistortRectifyMap(*arguments)
-        return maps[0], maps[1]
-    maps = cv2.fisheye.initUndistortRectifyMap(*arguments)
-    maps[0][_is_beyond_lens(eye)] = np.iinfo(np.int16).min
-    return maps[0], maps[1]
-
-
-def _is_beyond_lens(eye: EyeCalibration) -> NDArray[np.bool_]:
-    """Return which pixels (H, W) of the view of a fisheye lie further out than its model goes: up
-    to where the radius in the raw image grows with the angle. What lies behind it would be a
-    mirror image (Kannala and Brandt, A generic camera model, PAMI 2006).
-    """
-    angles = np.linspace(0, np.pi / 2, eye.width + eye.height)
-    falling = np.flatnonzero(np.diff(angles * np.polyval([*eye.D[::-1], 1.0], angles**2)) <= 0)
-    limit = angles[falling[0]] if len(falling) else np.pi / 2
-    u, v = np.meshgrid(np.arange(eye.width), np.arange(eye.height))
-    pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
-    rays = pixels @ np.linalg.inv(eye.P[:, :3]).T @ eye.R
-    return np.asarray(np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2]) > limit)
-
-
-def deblocked(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return a raw grey image (H, W) with the steps between flat blocks smoothed, the image itself
-    where it shows no block grid.
-
-    The grid is that of the compressed image: not to be used on rectified ones.
-    """
-    if not is_blocky(image):
-        return image
-    smooth = image.astype(np.float32)
-    _smooth_columns(smooth)
-    _smooth_columns(smooth.T)
-    return np.clip(np.rint(smooth), 0, 255).astype(np.uint8)
-
-
-def is_blocky(image: NDArray[np.uint8]) -> bool:
-    """Return whether quiet parts of a grey image (H, W) have larger steps on the grid of eight
-    pixels than within its blocks, along the rows or along the columns.
-    """
-    half = _BLOCK_PX // 2
-    return max(_blockiness(image[::half]), _blockiness(image[:, ::half].T)) > _MIN_RATIO
-
-
-def _blockiness(image: NDArray[np.uint8]) -> float:
-    """Return the ratio of the mean step across the borders of blocks to that in their middle."""
-    grey = image.astype(np.int16)
-
-    def mean_step(first: int) -> float:
-        before, at, after, beyond = (
-            grey[:, first + i : grey.shape[1] - 8 + i : _BLOCK_PX] for i in (-2, -1, 0, 1)
-        )
-        quiet = (np.abs(at - before) < _QUIET_GREY) & (np.abs(beyond - after) < _QUIET_GREY)
-        step = np.abs(after - at)
-        quiet &= step <= _SIGNIFICANT_GREY
-        return float(step[quiet].mean()) if np.count_nonzero(quiet) >= _MIN_PIXELS else 0.0
-
-    within = 0.5 * (mean_step(_BLOCK_PX + 3) + mean_step(_BLOCK_PX + 5))
-    return mean_step(_BLOCK_PX) / max(within, 0.1)
-
-
-def _smooth_columns(grey: NDArray[np.float32]) -> None:
-    """Turn the steps between the columns of two blocks into ramps, in place.
-
-    Only steps that are larger than what goes on in the half blocks beside them.
-    """
-    half = _BLOCK_PX // 2
-    last = grey.shape[1] - half + 1
-
-    def column(offset: int) -> NDArray[np.float32]:
-        return grey[:, _BLOCK_PX + offset : last + offset : _BLOCK_PX]
-
-    step = column(0) - column(-1)
-    size = np.abs(step)
-    activity = np.abs(column(-1) - column(-half))
-    activity += np.abs(column(half - 1) - column(0))
-    step[(size >= _MAX_STEP_GREY) | (activity >= np.maximum(size, 2))] = 0
-    for i in range(half):
-        share = step * np.float32(0.5 - (i + 0.5) / _BLOCK_PX)
-        before, after = column(-1 - i), column(i)
-        before += share
-        after -= share
+    width, height = int(info.width), int(info.height)
+    if width * height > MAX_PIXELS:
+        raise InputError(f'{name}: a calibration of images of {width}x{height} pixels is not taken')
+    # ROS 1 names the matrices in capitals, ROS 2 does not.
+    K, D, R, P = (getattr(info, n if hasattr(info, n) else n.lower()) for n in 'KDRP')
+    return EyeCalibration(width, height, K, D, R, P, info.distortion_model, name)

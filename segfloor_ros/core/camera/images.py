@@ -1,19 +1,9 @@
-"""Images as grey pixels, and what else ROS messages say, of `rclpy` as well as of `rosbags`.
-
-Encodings are decoded, 16 bits brought to 8, and the black border is found that rectification
-leaves: nothing was seen there. Messages tell calibrations and what wheels and IMUs have measured.
-
-Depth images as disparities: a depth camera is taken for a stereo pair whose right image is not
-there, but whose disparities are.
-
-Where a stereo frame has a right image, that of a depth camera has the disparity (H, W) float32 in
-pixels over a virtual baseline, not a number where nothing was measured. Active stereo and
-structured light measure disparities, too: their noise is about constant in this form.
+"""Images out of ROS messages, of `rclpy` as well as of `rosbags`: encodings are decoded, colours
+become grey where grey is asked for, and 16 bits are brought to 8.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import struct
 from typing import Any
 
@@ -21,21 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros import MAX_PIXELS
-from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.camera.pixels import Disparity
-from segfloor_ros.core.contracts import ImuSample, WheelPose
-from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.files.images import (
-    CorruptImageError,
-    Grey,
-    check_size,
-    decode_colour,
-    decode_file,
-)
-from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.quaternions import transform_from_quaternion
+from segfloor_ros.core.camera.pixels import Grey, check_size
+from segfloor_ros.core.errors import CorruptImageError, InputError
 
 USUAL_BIT_DEPTHS = (8, 10, 12, 14, 16)
 
@@ -62,13 +39,6 @@ DEPTH_HEADER = struct.Struct('<iff')
 and b of the pixel's value a / depth + b."""
 
 
-NOT_MEASURED = -1.0
-"""First element of a covariance of what an IMU does not measure (sensor_msgs/Imu)."""
-
-VIRTUAL_BASELINE_M = 0.075
-"""Between projector and camera of the first depth cameras; any value would do."""
-
-
 def grey_image(message: Any, name: str) -> Grey:
     """Return the grey image (H, W) of a sensor_msgs Image or CompressedImage, of `rclpy` or of
     `rosbags`; colour becomes grey.
@@ -77,7 +47,7 @@ def grey_image(message: Any, name: str) -> Grey:
     CorruptImageError when the data is damaged or not of the size the header says.
     """
     if not hasattr(message, 'encoding'):
-        return decode_file(bytes(message.data), name)
+        return _decoded(message.data, name)
     encoding = message.encoding
     if encoding not in CHANNELS:
         raise InputError(
@@ -90,7 +60,7 @@ def grey_image(message: Any, name: str) -> Grey:
 def colour_image(message: Any, name: str) -> Grey:
     """Return the image of a message as `grey_image`, but (H, W, 3), BGR, where it has colours."""
     if not hasattr(message, 'encoding'):
-        return decode_colour(bytes(message.data), name)
+        return _decoded(message.data, name, colour=True)
     encoding = message.encoding
     if CHANNELS.get(encoding, 1) == 1 and not encoding.startswith('bayer_'):
         return grey_image(message, name)
@@ -125,12 +95,19 @@ def _unpacked_depth(message: Any, name: str) -> NDArray[np.uint16] | NDArray[np.
     if len(data) < DEPTH_HEADER.size:
         raise CorruptImageError(f'{name}: {len(data)} bytes are no compressed depth image')
     _, scale, offset = DEPTH_HEADER.unpack_from(data)
-    pixels = decode_file(data[DEPTH_HEADER.size :], name).astype(np.uint16, copy=False)
+    pixels = _decoded(data[DEPTH_HEADER.size :], name).astype(np.uint16, copy=False)
     if DEPTH_TYPES[encoding] == np.uint16:
         return pixels
     with np.errstate(divide='ignore'):
         metres = np.float32(scale) / (pixels.astype(np.float32) - np.float32(offset))
     return np.where(pixels > 0, metres, np.float32(np.nan))
+
+
+def _decoded(data: Any, name: str, colour: bool = False) -> Grey:
+    """Return the image of the bytes of a compressed one; the decoders are loaded with the first."""
+    from segfloor_ros.core.files.images import decode_colour, decode_file
+
+    return (decode_colour if colour else decode_file)(bytes(data), name)
 
 
 def _unpacked(message: Any, name: str, channels: int, dtype: np.dtype[Any]) -> NDArray[Any]:
@@ -215,91 +192,3 @@ def _grey_of(pixels: Grey, encoding: str) -> Grey:
         code = cv2.COLOR_RGBA2GRAY if pixels.shape[2] == 4 else cv2.COLOR_RGB2GRAY
         return cv2.cvtColor(pixels, code)
     return to_grey(pixels)
-
-
-def stamp_ns(message: Any) -> int:
-    """Return the stamp in a message's header in ns."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-
-
-def eye_calibration(info: Any, name: str) -> EyeCalibration:
-    """Return the calibration of one eye of a CameraInfo. name: of the topic, for messages. Raises
-    CalibrationError or InputError.
-    """
-    width, height = int(info.width), int(info.height)
-    if width * height > MAX_PIXELS:
-        raise InputError(f'{name}: a calibration of images of {width}x{height} pixels is not taken')
-    # ROS 1 names the matrices in capitals, ROS 2 does not.
-    K, D, R, P = (getattr(info, n if hasattr(info, n) else n.lower()) for n in 'KDRP')
-    return EyeCalibration(width, height, K, D, R, P, info.distortion_model, name)
-
-
-def wheel_pose(message: Any, name: str) -> WheelPose:
-    """Return the pose that an Odometry of the wheels tells, NaN where it is none. name: of the
-    topic.
-    """
-    pose = message.pose.pose
-    try:
-        T_wheels_base = rigid_motion(pose.position, pose.orientation, name)
-    except InputError:
-        T_wheels_base = np.full((4, 4), np.nan)
-    return WheelPose(stamp_ns(message), T_wheels_base)
-
-
-def imu_sample(message: Any, T_left_imu: Array) -> ImuSample:
-    """Return a sample of an Imu at a pose (4, 4) in the rectified left optical frame."""
-    gyro, accel = xyz(message.angular_velocity), xyz(message.linear_acceleration)
-    return ImuSample.seen_from(T_left_imu, stamp_ns(message), gyro, accel)
-
-
-def measures_motion(message: Any) -> bool:
-    """Whether an Imu measures both angular velocity and acceleration."""
-    covariances = message.angular_velocity_covariance, message.linear_acceleration_covariance
-    return all(covariance[0] != NOT_MEASURED for covariance in covariances)
-
-
-def rigid_motion(translation: Any, rotation: Any, name: str) -> Array:
-    """Return the transform (4, 4) of a vector and a quaternion. Raises InputError where that is no
-    rotation.
-    """
-    quat_xyzw = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
-    length = float(np.linalg.norm(quat_xyzw))
-    if not abs(length - 1) < 0.01:
-        raise InputError(f'{name}: the orientation is no rotation; its length is {length:.3g}')
-    return transform_from_quaternion(xyz(translation), quat_xyzw)
-
-
-def xyz(vector: Any) -> Array:
-    """Return the components (3,) of a vector or point."""
-    return np.array([vector.x, vector.y, vector.z])
-
-
-def depth_calibration(left: EyeCalibration) -> StereoCalibration:
-    """Return the calibration of a depth camera whose depths are aligned with the raw left image: it
-    is freed of its distortion, but not turned.
-    """
-    P = np.hstack([left.K, np.zeros((3, 1))])
-    shift = np.array([[-left.K[0, 0] * VIRTUAL_BASELINE_M], [0.0], [0.0]])
-    straight = dataclasses.replace(left, R=np.eye(3), P=P)
-    virtual = EyeCalibration.of_rectified(
-        left.width, left.height, np.hstack([left.K, shift]), left.origin
-    )
-    return StereoCalibration(straight, virtual)
-
-
-def disparity_of_depth(
-    depth: NDArray[np.generic], camera: StereoCamera, metres_per_unit: float | None = None
-) -> Disparity:
-    """Return the disparity (H, W) of a depth image (H, W): uint16, in mm unless said otherwise, or
-    float32 in metres. What is 0, negative or not finite has none. Raises InputError.
-    """
-    if depth.dtype == np.uint16:
-        metres = depth.astype(np.float32) * np.float32(metres_per_unit or 1e-3)
-    elif depth.dtype == np.float32:
-        metres = depth.astype(np.float32) * np.float32(metres_per_unit or 1.0)
-    else:
-        raise InputError(f'depth images have 16 bits (mm) or are float (m), not {depth.dtype}')
-    with np.errstate(divide='ignore', invalid='ignore'):
-        disparity = np.float32(camera.disparity_times_depth) / metres
-    return np.where(np.isfinite(metres) & (metres > 0), disparity, np.float32(np.nan))

@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros import MAX_PIXELS
 from segfloor_ros.core.camera.model import StereoCamera, is_disparity
+from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import Array
 
 Region = NDArray[np.uint8]
@@ -198,3 +200,13 @@ def shrunk_camera(camera: StereoCamera, factor: int) -> StereoCamera:
         (camera.cy + 0.5) / factor - 0.5,
         camera.baseline_m,
     )
+
+
+Grey = NDArray[np.uint8] | NDArray[np.uint16]
+"""A grey image (H, W), uint8 or uint16."""
+
+
+def check_size(width: int, height: int, name: str) -> None:
+    """Raise InputError for an image that is larger than any camera's."""
+    if width * height > MAX_PIXELS:
+        raise InputError(f'{name}: an image of {width}x{height} pixels is not taken')

@@ -20,12 +20,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros import MAX_PIXELS
-from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.camera.pixels import Grey, check_size
+from segfloor_ros.core.errors import CorruptImageError, InputError
 from segfloor_ros.core.files.whole import read_bytes
-
-Grey = NDArray[np.uint8] | NDArray[np.uint16]
-"""A grey image (H, W), uint8 or uint16."""
 
 PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 JPEG_START, JPEG_END = b'\xff\xd8', b'\xff\xd9'
@@ -42,10 +39,6 @@ _standard_error: int | None = None
 
 JPEG_QUALITY = 90
 """Above this, JPEG images grow much faster than they improve."""
-
-
-class CorruptImageError(InputError):
-    """The data of one image is damaged; the rest of the recording may be fine."""
 
 
 def read_grey(path: Path) -> Grey:
@@ -101,12 +94,6 @@ def jpeg_bytes(image: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> bytes:
 def decode_colour(data: bytes, name: str) -> Grey:
     """Return the image of the bytes of a file as `decode_file`, BGR where it has colours."""
     return _decoded(data, name, COLOUR)
-
-
-def check_size(width: int, height: int, name: str) -> None:
-    """Raise InputError for an image that is larger than any camera's."""
-    if width * height > MAX_PIXELS:
-        raise InputError(f'{name}: an image of {width}x{height} pixels is not taken')
 
 
 def check_same_size(image: NDArray[Any], shape: tuple[int, ...], path: Path) -> None:

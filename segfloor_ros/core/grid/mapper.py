@@ -56,7 +56,6 @@ from segfloor_ros.core.grid.occupancy import (
     render,
     steps,
 )
-from segfloor_ros.core.slam.thresholds import MAJORITY
 
 _LEVER_M = 2.5
 """A turn of the base moves its evidence by the turn times this, about half a ray."""
@@ -71,6 +70,9 @@ _AROUND = np.ones((3, 3), np.uint8)
 
 BEHIND_M = 0.1
 """Nothing is free so close behind a face: walls are no thinner."""
+
+MAJORITY = 0.5
+"""Share of the keyframes that see a place which must agree on what stands there."""
 
 
 class OccupancyGridMapper:

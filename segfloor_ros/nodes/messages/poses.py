@@ -11,23 +11,18 @@ from geometry_msgs.msg import (
     Point,
     Pose,
     PoseStamped,
-    PoseWithCovarianceStamped,
     Quaternion,
     Transform,
     TransformStamped,
-    Twist,
     Vector3,
 )
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Path
 from numpy.typing import NDArray
-from sensor_msgs.msg import Imu
 
-from segfloor_ros.core.camera.images import NOT_MEASURED
-from segfloor_ros.core.contracts import ImuSample, KeyframePath, WheelPose
+from segfloor_ros.core.contracts import KeyframePath
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.geometry import Array, invert, make_transform, quaternions_of
+from segfloor_ros.core.geometry import Array, make_transform, quaternions_of
 from segfloor_ros.core.quaternions import rotations_of
-from segfloor_ros.core.twists import se3_log
 from segfloor_ros.nodes.messages.topics import make_header, to_ns
 
 LEAST_VARIANCE = 1e-6
@@ -48,71 +43,6 @@ def pose_array(pose: Pose) -> Array:
     if not np.isfinite(values).all() or np.linalg.norm(values[3:]) < 0.5:
         raise InputError(f'a pose of {values.tolist()} is impossible (x y z qx qy qz qw)')
     return make_transform(rotations_of(values[None, 3:])[0], values[:3])
-
-
-def odometry_message(
-    stamp_ns: int,
-    frame_id: str,
-    child_frame_id: str,
-    T_a_b: Array,
-    covariance: Array,
-    twist: Array | None = None,
-    twist_covariance: Array | None = None,
-) -> Odometry:
-    """Return the odometry of frame b in frame a.
-
-    covariance: (6, 6), order x y z roll pitch yaw. twist: (6,) linear and angular velocity in
-    frame b, m/s and rad/s, with its covariance (6, 6); None is marked as unknown by a large
-    variance.
-    """
-    message = Odometry(header=make_header(stamp_ns, frame_id), child_frame_id=child_frame_id)
-    message.pose.pose = pose_message(T_a_b)
-    message.pose.covariance = np.ascontiguousarray(covariance, np.float64).ravel()
-    if twist is None:
-        message.twist.covariance = (np.eye(6) / LEAST_VARIANCE).ravel()
-    else:
-        vx, vy, vz, wx, wy, wz = (float(value) for value in twist)
-        message.twist.twist = Twist(
-            linear=Vector3(x=vx, y=vy, z=vz), angular=Vector3(x=wx, y=wy, z=wz)
-        )
-        if twist_covariance is not None:
-            message.twist.covariance = np.ascontiguousarray(twist_covariance, np.float64).ravel()
-    return message
-
-
-def pose_with_covariance_message(
-    stamp_ns: int, frame_id: str, T_a_b: Array, covariance: Array
-) -> PoseWithCovarianceStamped:
-    """Return the pose of frame b in frame a. covariance: (6, 6), order x y z roll pitch yaw."""
-    message = PoseWithCovarianceStamped(header=make_header(stamp_ns, frame_id))
-    message.pose.pose = pose_message(T_a_b)
-    message.pose.covariance = np.ascontiguousarray(covariance, np.float64).ravel()
-    return message
-
-
-def body_twist(T_a_before: Array, T_a_now: Array, duration_s: float) -> Array:
-    """Return the mean velocity (6,) between two poses in the moving frame: m/s, rad/s."""
-    return se3_log(invert(T_a_before) @ T_a_now) / duration_s
-
-
-def twist_covariance(
-    covariance_before: Array, T_a_now: Array, covariance_now: Array, duration_s: float
-) -> Array:
-    """Return the covariance (6, 6) of the velocity between two poses, in the moving frame: what is
-    wrong with one has nothing to do with what is wrong with the other.
-
-    covariance_before, covariance_now: (6, 6) of the poses, in the axes of frame a.
-    """
-    axes = np.zeros((6, 6))
-    axes[:3, :3] = axes[3:, 3:] = T_a_now[:3, :3].T
-    return axes @ (covariance_before + covariance_now) @ axes.T / duration_s**2
-
-
-def never_certain(covariance: Array) -> Array:
-    """Return a covariance (6, 6) with `LEAST_VARIANCE` at least: the first pose is the origin by
-    definition.
-    """
-    return covariance + np.diag(np.maximum(LEAST_VARIANCE - np.diag(covariance), 0.0))
 
 
 class PathMessages:
@@ -189,26 +119,3 @@ def _pose_messages(T_a_b: Array) -> list[Pose]:
         Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
         for x, y, z, qx, qy, qz, qw in pose_numbers(T_a_b).tolist()
     ]
-
-
-def wheel_message(wheels: WheelPose, base_frame: str) -> Odometry:
-    """Return a pose that wheels tell as a message."""
-    no_covariance = np.zeros((6, 6))
-    return odometry_message(
-        wheels.stamp_ns, WHEELS_FRAME, base_frame, wheels.T_wheels_base, no_covariance
-    )
-
-
-def imu_message(sample: ImuSample, frame_id: str, R_frame_left: Array) -> Imu:
-    """Return a sample as a message in a frame that R_frame_left (3, 3) turns it into."""
-    message = Imu(
-        header=make_header(sample.stamp_ns, frame_id),
-        angular_velocity=_vector(R_frame_left @ sample.gyro_rad_s),
-        linear_acceleration=_vector(R_frame_left @ sample.accel_m_s2),
-    )
-    message.orientation_covariance[0] = NOT_MEASURED
-    return message
-
-
-def _vector(values: Array) -> Vector3:
-    return Vector3(x=float(values[0]), y=float(values[1]), z=float(values[2]))

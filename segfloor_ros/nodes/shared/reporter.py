@@ -17,7 +17,7 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from segfloor_ros.core.errors import SegfloorError
-from segfloor_ros.core.processes import rss_mb
+from segfloor_ros.core.memory import rss_mb
 from segfloor_ros.nodes.messages.diagnostics import (
     CONNECTIONS,
     HEALTH,

@@ -30,14 +30,8 @@ from rclpy.utilities import remove_ros_args
 
 from segfloor_ros.core.errors import SegfloorError, SettingsError
 from segfloor_ros.core.settings import SettingSpec, suggestion
-from segfloor_ros.nodes.configuration import (
-    NODE_SETTINGS,
-    ROS_PARAMETERS,
-    NodeSettings,
-    is_node_parameter,
-)
 from segfloor_ros.nodes.messages.topics import prepare_middleware
-from segfloor_ros.nodes.yaml_files import yaml_value
+from segfloor_ros.nodes.settings.shared import ROS_PARAMETERS, NodeSettings
 
 INTERRUPT_HEARD_S = 0.2
 
@@ -75,6 +69,8 @@ def check_arguments(arguments: Sequence[str]) -> None:
 
 def help_text(program: str) -> str:
     """Return what a node's program takes, with the parameters of the node."""
+    from segfloor_ros.nodes.configuration import NODE_SETTINGS  # of all nodes
+
     lines = [
         f'usage: {program} [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO]]',
         '',
@@ -234,10 +230,12 @@ class NodeParameters(Generic[Settings]):
         return {name: _parsed(assigned[name], specs[name]) for name in assigned & specs.keys()}
 
     def _refuse_unknown(self, given: Mapping[str, Any]) -> None:
+        from segfloor_ros.nodes.configuration import NODE_SETTINGS  # of all nodes
+
         known = [spec.name for spec in self.settings.specs()]
         for name in given:
             # A section `/**` of a parameter file reaches every node; names of other nodes are fine.
-            if not any(is_node_parameter(node, name) for node in NODE_SETTINGS):
+            if not any(settings.has(name) for settings in NODE_SETTINGS.values()):
                 node = self.settings.stage_name()
                 raise SettingsError(f'unknown parameter {node}.{name}{suggestion(name, known)}')
 
@@ -258,5 +256,7 @@ def command_line_parameters(arguments: Sequence[str]) -> dict[str, str]:
 
 
 def _parsed(text: str, spec: SettingSpec) -> Any:
+    from segfloor_ros.nodes.yaml_files import yaml_value
+
     value = yaml_value(text)
     return '' if value is None and spec.type is str else value

@@ -18,11 +18,11 @@ from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.core.errors import SegfloorError
 from segfloor_ros.core.files.arrays import MapFile
-from segfloor_ros.nodes.configuration import NodeSettings
 from segfloor_ros.nodes.messages.diagnostics import HEALTH_PERIOD_S
 from segfloor_ros.nodes.messages.topics import TOPICS, Topic, published_by
+from segfloor_ros.nodes.settings.shared import NodeSettings
 from segfloor_ros.nodes.shared.inputs import CHECK_S, Inputs
-from segfloor_ros.nodes.shared.maps import KeptState
+from segfloor_ros.nodes.shared.kept_state import KeptState
 from segfloor_ros.nodes.shared.reporter import Connections, Reporter, one_line
 from segfloor_ros.nodes.shared.running import NodeParameters
 

@@ -15,7 +15,6 @@ from geometry_msgs.msg import TransformStamped
 from segfloor_ros.core.contracts import FrameResult, Mount
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import Array, invert
-from segfloor_ros.nodes.configuration import StereoSlamNodeSettings
 from segfloor_ros.nodes.frame_tree import FrameTree
 from segfloor_ros.nodes.messages.poses import transform_array, transform_message
 from segfloor_ros.nodes.messages.topics import (
@@ -26,6 +25,7 @@ from segfloor_ros.nodes.messages.topics import (
     PATIENCE_S,
     to_ns,
 )
+from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import LOOK_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 

@@ -24,7 +24,8 @@ from segfloor_ros.core.grid.keyframe_evidence import evidence_from_arrays, evide
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED
 from segfloor_ros.core.plugins.assembly import make_pipeline
 from segfloor_ros.core.plugins.maps.pruning import prune
-from segfloor_ros.core.plugins.maps.saved_slam import load_pipeline, loaded_map, save_pipeline
+from segfloor_ros.core.plugins.maps.saved_pipeline import load_pipeline, save_pipeline
+from segfloor_ros.core.plugins.maps.saved_slam import loaded_map
 from segfloor_ros.nodes.configuration import resolve
 
 OTHER_CAMERA = StereoCamera(320, 240, 163.0, 162.0, 157.0, 120.5, 0.125)

@@ -13,9 +13,9 @@ from small_network import constant_network, grey_network
 from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT
 
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.core.contracts import FLOOR
 from segfloor_ros.core.grid.occupancy import FREE, UNKNOWN
-from segfloor_ros.nodes.map_files import load_map
 
 FRAMES = 16
 CLASSES = ('person', 'floor')

@@ -14,10 +14,10 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.apps.evaluation.report import write_report
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.core.files.results import read_map_file
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED
 from segfloor_ros.core.slam.settings import StereoSlamSettings
-from segfloor_ros.nodes.map_files import load_map
 
 FRAMES = 16
 

@@ -15,8 +15,8 @@ from command_line import segfloor, segfloor_process
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.apps.cli import main, view
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.nodes.map_files import load_map
 
 FRAMES = 16
 SAME = ('map.pgm', 'trajectory.txt', 'keyframes.txt', 'labelled_cloud.ply', 'settings.yaml')
@@ -136,7 +136,7 @@ def test_running_nodes_are_shown_until_an_interrupt(tmp_path):
     pytest.importorskip('rerun', reason='rerun is not installed')
     rclpy = pytest.importorskip('rclpy', reason='ROS is not installed')
     from segfloor_ros.apps.cli.replay_nodes import isolated_environment
-    from segfloor_ros.nodes.messages.arrays import grid_message
+    from segfloor_ros.nodes.messages.grids import grid_message
     from segfloor_ros.nodes.messages.topics import TOPICS
 
     environment, shown = isolated_environment(), tmp_path / 'live.rrd'

@@ -28,7 +28,8 @@ from camera_recordings import (
 )
 
 from segfloor_ros.apps.recordings.bag_file import CAMERA_INFO, COMPRESSED, IMAGE, find_topics
-from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration, StereoRectifier
+from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.core.camera.rectification import StereoRectifier
 from segfloor_ros.core.errors import CalibrationError, InputError
 
 STAMPS = [1_700_000_000_000_000_000 + i * 100 * MS for i in range(4)]

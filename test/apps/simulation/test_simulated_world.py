@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.simulation.scene import MovingBox, Person, Scene
 from segfloor_ros.apps.simulation.scene_file import (
     PLAN,
@@ -29,7 +30,7 @@ from segfloor_ros.apps.simulation.textures import GENERATORS, make_texture
 from segfloor_ros.apps.simulation.world import cap, merge, sides
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from segfloor_ros.nodes.map_files import load_map, save_map
+from segfloor_ros.nodes.map_files import save_map
 
 PATH = {'waypoints': [[0.5, 0.5], [1.5, 0.5]]}
 ROOM = [[0, 0], [4, 0], [4, 3], [0, 3]]

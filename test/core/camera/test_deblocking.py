@@ -7,12 +7,8 @@ import numpy as np
 import pytest
 from camera_recordings import calibration
 
-from segfloor_ros.core.camera.calibration import (
-    StereoCalibration,
-    StereoRectifier,
-    deblocked,
-    is_blocky,
-)
+from segfloor_ros.core.camera.calibration import StereoCalibration
+from segfloor_ros.core.camera.rectification import StereoRectifier, deblocked, is_blocky
 
 
 def weak_texture(seed: int = 0) -> np.ndarray:

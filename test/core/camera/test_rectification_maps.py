@@ -10,7 +10,9 @@ from camera_recordings import calibration, grey_pairs
 from numpy.typing import NDArray
 from test_stereo_calibration import COEFFICIENTS, T_RIGHT_LEFT, project, raw_eye
 
-from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration, StereoRectifier
+from segfloor_ros.apps.recordings.extrinsics import calibration_from_extrinsics
+from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.core.camera.rectification import StereoRectifier
 from segfloor_ros.core.errors import CalibrationError
 
 
@@ -55,7 +57,7 @@ def ideal_image(eye: EyeCalibration) -> NDArray[np.uint8]:
 @pytest.mark.parametrize('model', COEFFICIENTS)
 def test_rectified_images_are_those_of_the_ideal_camera(model: str) -> None:
     eyes = small_eye(model, 320.0), small_eye(model, 330.0)
-    pair = StereoCalibration.from_extrinsics(*eyes, T_RIGHT_LEFT)
+    pair = calibration_from_extrinsics(*eyes, T_RIGHT_LEFT)
     images = StereoRectifier(pair).rectify(raw_image(pair.left), raw_image(pair.right))
     for image, eye in zip(images, (pair.left, pair.right), strict=True):
         assert image.dtype == np.uint8

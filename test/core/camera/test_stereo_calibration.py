@@ -31,6 +31,7 @@ from segfloor_ros.apps.recordings.calibration_files import (
     read_kitti_calibration,
     write_ros_calibration,
 )
+from segfloor_ros.apps.recordings.extrinsics import calibration_from_extrinsics
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.recording import StereoCameraSettings
 from segfloor_ros.core.errors import CalibrationError
@@ -67,7 +68,7 @@ def project(eye: EyeCalibration, points: np.ndarray) -> np.ndarray:
 def test_points_seen_by_both_eyes_lie_on_one_row_at_the_disparity_of_their_depth(
     model: str,
 ) -> None:
-    pair = StereoCalibration.from_extrinsics(raw_eye(model), raw_eye(model, 330.0), T_RIGHT_LEFT)
+    pair = calibration_from_extrinsics(raw_eye(model), raw_eye(model, 330.0), T_RIGHT_LEFT)
     points_left = np.random.default_rng(1).uniform((-1, -0.8, 2), (1, 0.8, 6), (50, 3))
     points_right = transform_points(T_RIGHT_LEFT, points_left)
     uv_left = rectified_pixels(pair.left, project(pair.left, points_left))
@@ -84,7 +85,7 @@ def test_points_seen_by_both_eyes_lie_on_one_row_at_the_disparity_of_their_depth
 
 @pytest.mark.parametrize('model', COEFFICIENTS)
 def test_ros_files_return_every_number(tmp_path: Path, model: str) -> None:
-    pair = StereoCalibration.from_extrinsics(raw_eye(model), raw_eye(model, 330.0), T_RIGHT_LEFT)
+    pair = calibration_from_extrinsics(raw_eye(model), raw_eye(model, 330.0), T_RIGHT_LEFT)
     left, right = tmp_path / 'left.yaml', tmp_path / 'right.yaml'
     write_ros_calibration(left, pair.left, 'left')
     write_ros_calibration(right, pair.right, 'right')
@@ -160,9 +161,7 @@ def kalibr_file(folder: Path, old: str = '', new: str = '') -> Path:
 def test_kalibr_files_hold_both_cameras(tmp_path: Path) -> None:
     path = kalibr_file(tmp_path)
     model = 'equidistant'
-    expected = StereoCalibration.from_extrinsics(
-        raw_eye(model), raw_eye(model, 330.0), T_RIGHT_LEFT
-    )
+    expected = calibration_from_extrinsics(raw_eye(model), raw_eye(model, 330.0), T_RIGHT_LEFT)
     given = given_calibration(StereoCameraSettings(left_calibration=str(path)))
     found = find_calibration('drive', (tmp_path,), StereoCameraSettings())
     for pair in (read_calibration(path, path), given, found):
@@ -193,7 +192,7 @@ def test_faults_in_kalibr_files_are_named(tmp_path: Path, old: str, new: str, me
 
 def test_the_view_of_a_fisheye_keeps_its_share_of_the_resolution_in_the_middle() -> None:
     model = 'equidistant'
-    pair = StereoCalibration.from_extrinsics(raw_eye(model), raw_eye(model, 330.0), T_RIGHT_LEFT)
+    pair = calibration_from_extrinsics(raw_eye(model), raw_eye(model, 330.0), T_RIGHT_LEFT)
     # Two directions a degree apart, around the middle of the view.
     middle = np.array([pair.camera.width - 1, pair.camera.height - 1]) / 2
     for eye in (pair.left, pair.right):
@@ -298,7 +297,7 @@ def test_eyes_of_different_size_are_refused() -> None:
 def test_eyes_of_different_models_have_no_common_rectification() -> None:
     eyes = raw_eye('plumb_bob', origin='one'), raw_eye('equidistant', origin='other')
     with pytest.raises(CalibrationError, match='one is plumb_bob, other is equidistant; both'):
-        StereoCalibration.from_extrinsics(*eyes, T_RIGHT_LEFT)
+        calibration_from_extrinsics(*eyes, T_RIGHT_LEFT)
 
 
 @pytest.mark.parametrize(

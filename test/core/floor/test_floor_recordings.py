@@ -10,8 +10,8 @@ from floor_scenes import FLOORS, MOUNT, SMALL_CAMERA, Scene, floor_patch, wall
 
 from segfloor_ros.apps.evaluation.floor import count_pixels, draw_outline, read_outlines
 from segfloor_ros.apps.recordings import open_source
-from segfloor_ros.core.camera.calibration import deblocked
 from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.rectification import deblocked
 from segfloor_ros.core.contracts import FLOOR, Mount
 from segfloor_ros.core.floor.disparity.profile import FloorLine
 from segfloor_ros.core.floor.segmentation import FloorSegmentation

@@ -18,7 +18,7 @@ from floor_scenes import (
     wall,
 )
 
-from segfloor_ros.core.camera.images import disparity_of_depth
+from segfloor_ros.core.camera.depth import disparity_of_depth
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR, Mount
 from segfloor_ros.core.floor.disparity.profile import FloorLine
 from segfloor_ros.core.floor.segmentation import FloorSegmentation

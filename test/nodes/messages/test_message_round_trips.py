@@ -6,8 +6,7 @@ from node_messages import grid_arrays
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.core.camera.images import eye_calibration
+from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration, eye_calibration
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import (
     POINT_FLOOR,
@@ -27,14 +26,20 @@ from segfloor_ros.core.errors import CalibrationError, InputError
 from segfloor_ros.core.geometry import R_ROS_OPTICAL, make_transform
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.twists import se3_exp
-from segfloor_ros.nodes.messages import arrays, poses
-from segfloor_ros.nodes.messages.arrays import (
-    camera_info_message,
-    map_start_message,
-    map_start_ns,
-    rectified_calibration,
+from segfloor_ros.nodes.messages import (
+    camera_infos,
+    grids,
+    images,
+    odometry,
+    points,
+    poses,
+    scans,
+    sensors,
 )
+from segfloor_ros.nodes.messages import images as arrays
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import Level, Status, status_message, statuses
+from segfloor_ros.nodes.messages.map_starts import map_start_message, map_start_ns
 from segfloor_ros.nodes.messages.topics import to_ns, to_time
 
 STAMP_NS = 1_403_715_273_262_142_976
@@ -56,13 +61,13 @@ def test_stamps_keep_every_nanosecond() -> None:
 def test_a_grey_image_survives() -> None:
     for dtype in (np.uint8, np.uint16):
         image = RNG.integers(0, np.iinfo(dtype).max, (5, 7)).astype(dtype)
-        message = over_the_wire(arrays.image_message(STAMP_NS, 'eye', image))
+        message = over_the_wire(images.image_message(STAMP_NS, 'eye', image))
         assert (message.header.frame_id, to_ns(message.header.stamp)) == ('eye', STAMP_NS)
         np.testing.assert_array_equal(arrays.grey_image(message, 'left'), image)
 
 
 def test_colour_and_padded_rows_become_grey() -> None:
-    message = arrays.image_message(0, '', np.zeros((2, 8), np.uint8))
+    message = images.image_message(0, '', np.zeros((2, 8), np.uint8))
     message.encoding, message.width, message.step = 'bgr8', 2, 8
     message.data[:6] = type(message.data)('B', [10, 10, 10, 200, 200, 200])
     np.testing.assert_array_equal(arrays.grey_image(message, 'left'), [[10, 200], [0, 0]])
@@ -73,7 +78,7 @@ def test_colour_and_padded_rows_become_grey() -> None:
     [{'encoding': '32FC1'}, {'width': 9}, {'step': 3}, {'height': 10_000, 'width': 10_000}],
 )
 def test_an_image_that_contradicts_itself_is_refused_by_name(change) -> None:
-    message = arrays.image_message(0, '', np.zeros((4, 8), np.uint8))
+    message = images.image_message(0, '', np.zeros((4, 8), np.uint8))
     for field, value in change.items():
         setattr(message, field, value)
     with pytest.raises(InputError, match='left/image_raw'):
@@ -84,19 +89,19 @@ def test_an_image_that_contradicts_itself_is_refused_by_name(change) -> None:
 def test_a_png_survives_and_a_jpeg_nearly(dtype) -> None:
     y, x = np.mgrid[0:40, 0:60]
     image = (100 + 50 * np.sin(x / 9) + y).astype(dtype)
-    exact = over_the_wire(arrays.compressed_message(STAMP_NS, 'left', image, None))
+    exact = over_the_wire(camera_infos.compressed_message(STAMP_NS, 'left', image, None))
     assert (to_ns(exact.header.stamp), exact.header.frame_id) == (STAMP_NS, 'left')
     found = arrays.grey_image(exact, 'left/image_raw/compressed')
     np.testing.assert_array_equal(found, image)
     assert found.dtype == dtype
-    small = over_the_wire(arrays.compressed_message(STAMP_NS, 'left', image, 90))
+    small = over_the_wire(camera_infos.compressed_message(STAMP_NS, 'left', image, 90))
     assert small.format.endswith('mono8' if dtype == np.uint8 else 'mono16')
     lossy = arrays.grey_image(small, 'left/image_raw/compressed')
     assert np.abs(lossy.astype(int) - image.astype(int)).max() <= (8 if dtype == np.uint8 else 0)
 
 
 def test_a_damaged_file_is_refused_by_topic() -> None:
-    message = arrays.compressed_message(STAMP_NS, 'left', np.zeros((40, 60), np.uint8), 90)
+    message = camera_infos.compressed_message(STAMP_NS, 'left', np.zeros((40, 60), np.uint8), 90)
     message.data = message.data[:-9]
     with pytest.raises(InputError, match='left/image_raw/compressed: the JPEG is truncated'):
         arrays.grey_image(message, 'left/image_raw/compressed')
@@ -134,11 +139,11 @@ def _camera() -> StereoCamera:
 
 def test_poses_paths_and_transforms_survive() -> None:
     stack = se3_exp(RNG.normal(size=(4, 6)))
-    odometry = over_the_wire(
-        poses.odometry_message(STAMP_NS, 'odom', 'base_link', stack[0], np.diag(np.arange(6.0)))
+    message = over_the_wire(
+        odometry.odometry_message(STAMP_NS, 'odom', 'base_link', stack[0], np.diag(np.arange(6.0)))
     )
-    np.testing.assert_allclose(poses.pose_array(odometry.pose.pose), stack[0], atol=1e-15)
-    np.testing.assert_array_equal(odometry.pose.covariance.reshape(6, 6), np.diag(np.arange(6.0)))
+    np.testing.assert_allclose(poses.pose_array(message.pose.pose), stack[0], atol=1e-15)
+    np.testing.assert_array_equal(message.pose.covariance.reshape(6, 6), np.diag(np.arange(6.0)))
     path = KeyframePath(np.array([5, 7, STAMP_NS, STAMP_NS + 1]), stack)
     back = poses.path_arrays(over_the_wire(poses.PathMessages('map').next(STAMP_NS, path)))
     np.testing.assert_array_equal(back.stamp_ns, path.stamp_ns)
@@ -170,7 +175,7 @@ def test_of_the_two_quaternions_of_a_turn_the_one_with_a_positive_w_is_sent() ->
 
 def test_what_an_imu_measured_is_turned_into_the_frame_of_the_message() -> None:
     sample = ImuSample(STAMP_NS, np.array([1.0, 2, 3]), np.array([4.0, 5, 6]), np.zeros(3))
-    message = over_the_wire(poses.imu_message(sample, 'imu_link', R_ROS_OPTICAL))
+    message = over_the_wire(sensors.imu_message(sample, 'imu_link', R_ROS_OPTICAL))
     turn, push = message.angular_velocity, message.linear_acceleration
     # Optical x right, y down, z forward; x forward, y left, z up.
     assert (turn.x, turn.y, turn.z) == (3.0, -1.0, -2.0)
@@ -182,21 +187,21 @@ def test_the_velocity_is_in_the_moving_frame() -> None:
     after = before.copy()
     after[:3, 3] = [0.0, 0.2, 0.0]
     np.testing.assert_allclose(
-        poses.body_twist(before, after, 0.1), [2.0, 0, 0, 0, 0, 0], atol=1e-12
+        odometry.body_twist(before, after, 0.1), [2.0, 0, 0, 0, 0, 0], atol=1e-12
     )
 
 
 def test_the_covariance_of_the_velocity_is_that_of_both_poses_in_the_moving_frame() -> None:
     left = make_transform(Rotation.from_euler('z', 90, degrees=True).as_matrix(), np.zeros(3))
     before, now = np.diag([4.0, 1, 0, 0, 0, 1]), np.diag([12.0, 3, 0, 0, 0, 3])
-    found = poses.twist_covariance(before, left, now, 2.0)
+    found = odometry.twist_covariance(before, left, now, 2.0)
     # x of the frame points along y of the moving frame, with its sign turned; 2 s: a quarter.
     np.testing.assert_allclose(found, np.diag([1.0, 4, 0, 0, 0, 1]), atol=1e-12)
     # An eighth of a turn: what is unsure along x of the frame is so ahead and to the right.
     slanted = make_transform(Rotation.from_euler('z', 45, degrees=True).as_matrix(), np.zeros(3))
-    ahead = poses.twist_covariance(np.zeros((6, 6)), slanted, np.diag([4.0, 0, 0, 0, 0, 0]), 1.0)
+    ahead = odometry.twist_covariance(np.zeros((6, 6)), slanted, np.diag([4.0, 0, 0, 0, 0, 0]), 1.0)
     np.testing.assert_allclose(ahead[:2, :2], [[2.0, -2.0], [-2.0, 2.0]], atol=1e-12)
-    message = poses.odometry_message(0, 'odom', 'base_link', left, now, np.ones(6), found)
+    message = odometry.odometry_message(0, 'odom', 'base_link', left, now, np.ones(6), found)
     np.testing.assert_allclose(over_the_wire(message).twist.covariance.reshape(6, 6), found)
 
 
@@ -205,7 +210,7 @@ def test_no_variance_is_below_the_least_one() -> None:
     covariance[0, 2] = covariance[2, 0] = 1e-12
     expected = np.diag([1e-6, 1e-6, 2.0, 1e-6, 1e-6, 1e-6])
     expected[0, 2] = expected[2, 0] = 1e-12
-    np.testing.assert_allclose(poses.never_certain(covariance), expected, rtol=1e-12)
+    np.testing.assert_allclose(odometry.never_certain(covariance), expected, rtol=1e-12)
 
 
 def test_impossible_poses_are_refused() -> None:
@@ -265,10 +270,10 @@ def test_clouds_survive() -> None:
     features = KeyframeFeatures(
         RNG.uniform(0, 640, (5, 2)).astype(np.float32), np.array([3, -1, 7, 9, 2], np.int32), xyz
     )
-    message = over_the_wire(arrays.features_message(STAMP_NS, 'map', features))
+    message = over_the_wire(points.features_message(STAMP_NS, 'map', features))
     assert [field.name for field in message.fields] == ['x', 'y', 'z', 'u', 'v', 'id']
     assert not message.is_dense
-    back = arrays.features_arrays(message, 'keyframe/features')
+    back = points.features_arrays(message, 'keyframe/features')
     np.testing.assert_array_equal(back.xyz_map, xyz)
     np.testing.assert_array_equal(back.uv_px, features.uv_px)
     np.testing.assert_array_equal(back.point_id, features.point_id)
@@ -281,13 +286,13 @@ def test_labelled_points_survive_and_are_told_apart() -> None:
         np.array([POINT_FLOOR, POINT_OBSTACLE, POINT_UNKNOWN], np.uint8),
         np.array([0.25, 1.0, 0.0], np.float32),
     )
-    message = over_the_wire(arrays.labelled_message(0, 'map', labelled))
+    message = over_the_wire(points.labelled_message(0, 'map', labelled))
     assert {f.name for f in message.fields} == {'x', 'y', 'z', 'id', 'label', 'confidence'}
-    back = arrays.labelled_arrays(message, 'labelled_points')
+    back = points.labelled_arrays(message, 'labelled_points')
     for name in ('point_id', 'xyz_map', 'label', 'confidence'):
         np.testing.assert_array_equal(getattr(back, name), getattr(labelled, name))
-    obstacles = arrays.points_at(0, 'map', labelled, np.array([1]))
-    only = arrays.sparse_cloud_arrays(obstacles, 'obstacle_points')
+    obstacles = points.points_at(0, 'map', labelled, np.array([1]))
+    only = points.sparse_cloud_arrays(obstacles, 'obstacle_points')
     assert only.point_id.tolist() == [4]
     np.testing.assert_array_equal(only.xyz_map, [[3, 4, 5]])
 
@@ -295,8 +300,8 @@ def test_labelled_points_survive_and_are_told_apart() -> None:
 def test_a_foreign_cloud_is_read_by_its_field_names() -> None:
     """Big endian, doubles, other order, padded rows and two rows."""
     dtype = np.dtype([('id', '>i4'), ('z', '>f8'), ('y', '>f8'), ('x', '>f8')])
-    points = np.array([(7, 3, 2, 1), (8, 6, 5, 4)], dtype)
-    message = arrays.sparse_cloud_message(
+    rows = np.array([(7, 3, 2, 1), (8, 6, 5, 4)], dtype)
+    message = points.sparse_cloud_message(
         0, 'map', SparseCloud(np.zeros(0, np.int32), np.zeros((0, 3)))
     )
     offsets = {'id': 0, 'z': 4, 'y': 12, 'x': 20}
@@ -304,23 +309,23 @@ def test_a_foreign_cloud_is_read_by_its_field_names() -> None:
         field.offset, field.datatype = offsets[field.name], 5 if field.name == 'id' else 8
     message.is_bigendian, message.point_step = True, 28
     message.height, message.width, message.row_step = 2, 1, 32
-    padded = b''.join(p.tobytes() + b'junk' for p in points)
+    padded = b''.join(p.tobytes() + b'junk' for p in rows)
     message.data = type(message.data)('B', padded)
-    back = arrays.sparse_cloud_arrays(message, 'map_points')
+    back = points.sparse_cloud_arrays(message, 'map_points')
     assert back.point_id.tolist() == [7, 8]
     np.testing.assert_array_equal(back.xyz_map, [[1, 2, 3], [4, 5, 6]])
 
 
 def test_clouds_that_contradict_themselves_are_refused_by_name() -> None:
     cloud = SparseCloud(np.array([1], np.int32), np.zeros((1, 3), np.float32))
-    short = arrays.sparse_cloud_message(0, 'map', cloud)
+    short = points.sparse_cloud_message(0, 'map', cloud)
     short.width = 2
     with pytest.raises(InputError, match='map_points: 16 bytes'):
-        arrays.sparse_cloud_arrays(short, 'map_points')
-    without = arrays.sparse_cloud_message(0, 'map', cloud)
+        points.sparse_cloud_arrays(short, 'map_points')
+    without = points.sparse_cloud_message(0, 'map', cloud)
     without.fields = [field for field in without.fields if field.name != 'id']
     with pytest.raises(InputError, match='map_points: the cloud has no field id'):
-        arrays.sparse_cloud_arrays(without, 'map_points')
+        points.sparse_cloud_arrays(without, 'map_points')
 
 
 def test_the_floor_scan_survives() -> None:
@@ -328,9 +333,9 @@ def test_the_floor_scan_survives() -> None:
     standing = np.array([1.0, np.nan, np.nan], np.float32)
     for obstacles, movable in ((None, None), (standing, None), (standing, ranges)):
         scan = FloorScan(-0.5, 0.25, ranges, obstacles, 8.25, movable)
-        message = over_the_wire(arrays.scan_message(STAMP_NS, 'base_link', scan))
+        message = over_the_wire(scans.scan_message(STAMP_NS, 'base_link', scan))
         assert (message.angle_min, message.angle_max) == (-0.5, 0.0)
-        back = arrays.scan_arrays(message, 'scan')
+        back = scans.scan_arrays(message, 'scan')
         assert (back.angle_min_rad, back.angle_increment_rad) == (-0.5, 0.25)
         assert back.range_max_m == 8.25
         np.testing.assert_array_equal(back.ranges_m, ranges)
@@ -346,7 +351,7 @@ def test_the_disparity_image_gives_depth() -> None:
     counted = VDisparity(np.zeros((3, 128), np.intp), 0, 2)
     mask, scan = np.zeros((3, 4), np.uint8), FloorScan(0, 1, disparity[0])
     seen = FloorObservation(disparity, mask, np.zeros(3), scan, 64.0, counted)
-    message = over_the_wire(arrays.disparity_message(0, 'eye', _camera(), seen))
+    message = over_the_wire(images.disparity_message(0, 'eye', _camera(), seen))
     pixels = np.frombuffer(message.image.data, np.float32).reshape(3, 4)
     np.testing.assert_array_equal(pixels, disparity)
     assert message.f * message.t / pixels[0, 1] == pytest.approx(2.0 * 0.1 / 2.0)
@@ -356,7 +361,7 @@ def test_the_disparity_image_gives_depth() -> None:
 def test_the_map_is_row_major_from_its_lower_left_cell() -> None:
     cells = np.array([[0, 100, -1], [-1, -1, 0]], np.int8)
     grid = OccupancyGrid(cells, 0.05, (-1.0, 2.0))
-    message = over_the_wire(arrays.grid_message(STAMP_NS, 'map', grid))
+    message = over_the_wire(grids.grid_message(STAMP_NS, 'map', grid))
     assert (message.info.width, message.info.height) == (3, 2)
     assert list(message.data) == [0, 100, -1, -1, -1, 0]
     assert (message.info.origin.position.x, message.info.origin.position.y) == (-1.0, 2.0)

@@ -27,7 +27,6 @@ from segfloor_ros.core.contracts import (
 from segfloor_ros.core.errors import CalibrationError, InputError, MapError
 from segfloor_ros.core.files.arrays import Arrays, MapFile
 from segfloor_ros.core.geometry import invert, transform_points, without_drift
-from segfloor_ros.core.pipeline import Pipeline
 from segfloor_ros.core.plugins.sensors.gyroscope import MOMENT_NS
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 
@@ -187,21 +186,3 @@ def new_keyframes(path: KeyframePath) -> KeyframePath:
     """Return the keyframes of the drive itself, without those of the map that was loaded."""
     new = path.stamp_ns >= 0
     return KeyframePath(path.stamp_ns[new], path.T_map_base[new])
-
-
-def save_pipeline(pipeline: Pipeline) -> MapFile:
-    """Return the whole map, once all keyframes are finished. Raises MapError before there is
-    one.
-    """
-    saved = save_slam(pipeline.slam, pipeline.slam.rig.camera)
-    saved.parts |= pipeline.keyframe_stages.to_arrays()
-    return saved
-
-
-def load_pipeline(pipeline: Pipeline, saved: MapFile, name: str, localize: bool) -> None:
-    """Go on with a saved map, before the first frame. localize: it stays as it is. Raises
-    InputError, by the file's name, for one that is damaged or of another camera.
-    """
-    loaded = load_slam(pipeline.slam, pipeline.slam.rig.camera, saved, name, localize)
-    with parts_that_fit(name):
-        pipeline.load(saved.parts, loaded)

@@ -7,12 +7,12 @@ import pytest
 from command_line import segfloor_process
 from small_network import FittedNetwork
 
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.simulation.scene_file import open_scene
 from segfloor_ros.apps.simulation.simulation import RecordingOptions, Simulation, record
 from segfloor_ros.apps.simulation.solids import CLASSES
 from segfloor_ros.apps.simulation.world import RenderingError
 from segfloor_ros.core.grid.occupancy import OCCUPIED
-from segfloor_ros.nodes.map_files import load_map
 from segfloor_ros.nodes.network_files import open_network
 
 CAMERA = ['camera.width=320', 'camera.height=240']

@@ -8,13 +8,14 @@ from command_line import segfloor
 from floor_scenes import CAMERA, MOUNT
 
 from segfloor_ros.apps.label_files import draw_labels, filter_mask, save_labels
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NO_POINT, KeyframeFeatures, KeyframePath
 from segfloor_ros.core.contracts import NOT_FLOOR as STANDING
 from segfloor_ros.core.errors import InputError, SettingsError
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from segfloor_ros.core.plugins.semantics.label_map import LabelMap, Labels
 from segfloor_ros.core.plugins.semantics.outputs import UNLABELLED
-from segfloor_ros.nodes.map_files import load_map, save_map
+from segfloor_ros.nodes.map_files import save_map
 
 CLASSES = ['carpet', 'tiles', 'door']
 SHAPE = (CAMERA.height, CAMERA.width)

@@ -1,0 +1,67 @@
+"""What a camera publishes besides raw images: calibrations and compressed images."""
+
+from __future__ import annotations
+
+import array
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from sensor_msgs.msg import CameraInfo, CompressedImage
+
+from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.nodes.messages.topics import make_header
+
+
+def camera_info_message(stamp_ns: int, frame_id: str, eye: EyeCalibration) -> CameraInfo:
+    """Return the calibration of one eye; both eyes carry the left optical frame (REP-104: the
+    right one's offset stands in P[3]).
+    """
+    return CameraInfo(
+        header=make_header(stamp_ns, frame_id),
+        width=int(eye.width),
+        height=int(eye.height),
+        distortion_model=eye.distortion_model,
+        d=array.array('d', np.asarray(eye.D, np.float64).tobytes()),
+        k=np.asarray(eye.K, np.float64).ravel(),
+        r=np.asarray(eye.R, np.float64).ravel(),
+        p=np.asarray(eye.P, np.float64).ravel(),
+    )
+
+
+def same_calibration(a: CameraInfo, b: CameraInfo) -> bool:
+    """Return whether two messages hold the same calibration."""
+    sizes = ((a.width, a.height), (b.width, b.height))
+    return (
+        sizes[0] == sizes[1]
+        and a.distortion_model == b.distortion_model
+        and all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ('d', 'k', 'r', 'p'))
+    )
+
+
+def rectified_calibration(camera: StereoCamera) -> StereoCalibration:
+    """Return the calibration of rectified images of a camera."""
+    P = np.zeros((3, 4))
+    P[:, :3] = camera.K
+    left = EyeCalibration.of_rectified(camera.width, camera.height, P)
+    P[0, 3] = -camera.disparity_times_depth
+    right = EyeCalibration.of_rectified(camera.width, camera.height, P)
+    return StereoCalibration(left, right)
+
+
+def compressed_message(
+    stamp_ns: int, frame_id: str, image: NDArray[np.generic], jpeg_quality: int | None
+) -> CompressedImage:
+    """Return a grey image (H, W) as a message as image_transport makes it: JPEG of a quality of
+    1 to 100, or PNG, without loss, where that is None or the image has 16 bits.
+    """
+    kind = 'png' if jpeg_quality is None or image.dtype == np.uint16 else 'jpeg'
+    options = [] if kind == 'png' else [cv2.IMWRITE_JPEG_QUALITY, int(jpeg_quality or 0)]
+    _, data = cv2.imencode(f'.{kind}', np.ascontiguousarray(image), options)
+    encoding = 'mono16' if image.dtype == np.uint16 else 'mono8'
+    return CompressedImage(
+        header=make_header(stamp_ns, frame_id),
+        format=f'{encoding}; {kind} compressed {encoding}',
+        data=array.array('B', data.tobytes()),
+    )

@@ -1,0 +1,81 @@
+"""Arrays as messages: images, their calibrations and the floor seen in them (mask, disparity,
+scan); points as NumPy structured arrays (features, the sparse map, labelled points), the
+occupancy grid, saved maps or parts of one, and which map a keyframe belongs to.
+"""
+
+from __future__ import annotations
+
+import array
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sensor_msgs.msg import Image
+from stereo_msgs.msg import DisparityImage
+
+from segfloor_ros.core.camera.images import depth_image, grey_image
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.pixels import Grey
+from segfloor_ros.core.contracts import FloorObservation
+from segfloor_ros.core.errors import InputError
+from segfloor_ros.nodes.messages.topics import make_header
+
+ENCODING_OF = {np.uint8: 'mono8', np.uint16: 'mono16', np.float32: '32FC1'}
+
+
+def image_message(
+    stamp_ns: int, frame_id: str, image: NDArray[np.generic], encoding: str = ''
+) -> Image:
+    """Return an image (H, W), or (H, W, 3) with its encoding, as a message; grey images of 8 and 16
+    bits and disparities, float32, need none.
+    """
+    if not encoding:
+        encoding = ENCODING_OF[image.dtype.type]
+    pixels = np.ascontiguousarray(image)
+    height, width = pixels.shape[:2]
+    return Image(
+        header=make_header(stamp_ns, frame_id),
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=0,
+        step=pixels.strides[0],
+        data=array.array('B', pixels.tobytes()),
+    )
+
+
+def grey8_image(message: Image, topic: str) -> NDArray[np.uint8]:
+    """Return the grey image (H, W) of a message of 8 bits. Raises InputError."""
+    return _eight_bit(grey_image(message, topic), message, topic)
+
+
+def _eight_bit(image: Grey, message: Image, topic: str) -> NDArray[np.uint8]:
+    if image.dtype != np.uint8:
+        raise InputError(f'{topic}: {message.encoding} has 16 bits, expected 8')
+    return image.astype(np.uint8, copy=False)
+
+
+def right_image(message: Image, topic: str) -> NDArray[Any]:
+    """Return the right image (H, W) uint8 of a message; of a depth camera the disparity (H, W)
+    float32 in its place. Raises InputError.
+    """
+    if message.encoding != '32FC1':
+        return grey8_image(message, topic)
+    return depth_image(message, topic)
+
+
+def disparity_message(
+    stamp_ns: int, frame_id: str, camera: StereoCamera, floor: FloorObservation
+) -> DisparityImage:
+    """Return the disparity image: Z = f * t / d; 0 where there is no match."""
+    message = DisparityImage(
+        header=make_header(stamp_ns, frame_id),
+        image=image_message(stamp_ns, frame_id, floor.disparity_px, '32FC1'),
+        f=float(camera.fx),
+        t=float(camera.baseline_m),
+        min_disparity=0.0,
+        max_disparity=float(floor.max_disparity_px),
+        delta_d=1.0 / 16.0,
+    )
+    message.valid_window.width, message.valid_window.height = camera.width, camera.height
+    return message

@@ -1,0 +1,25 @@
+"""Saved maps or parts of one, and which map a keyframe belongs to."""
+
+from __future__ import annotations
+
+import array
+
+from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
+
+from segfloor_ros.core.files.arrays import MapFile
+
+
+def map_file_message(saved: MapFile) -> UInt8MultiArray:
+    """Return a map, or a part of one, as the bytes of its file, not compressed."""
+    from segfloor_ros.core.files.results import FORMAT, to_bytes
+
+    data = array.array('B', to_bytes(saved, compress=False))
+    size = MultiArrayDimension(label=FORMAT, size=len(data), stride=len(data))
+    return UInt8MultiArray(layout=MultiArrayLayout(dim=[size]), data=data)
+
+
+def map_file_of(message: UInt8MultiArray, topic: str) -> MapFile:
+    """Return the map of a message. Raises InputError, by the topic's name, for other bytes."""
+    from segfloor_ros.core.files.results import from_bytes
+
+    return from_bytes(bytes(message.data), topic)
