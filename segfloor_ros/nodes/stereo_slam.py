@@ -168,7 +168,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
                 InTime.LATE: 'older than the pair before it; dropped',
                 InTime.ELSEWHERE: f'its stamp is {step_s:.3f} s from the one before; dropped',
             }
-            self.reporter.health.count('stamps out of order')
+            self.reporter.health.count('dropped')
             self.reporter.report(stamp_ns, Level.ERROR, words[found])
             return False
         if found is InTime.JUMPED and step_s < 0:
