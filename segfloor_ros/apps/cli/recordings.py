@@ -223,17 +223,21 @@ def view(
     segfloor view drive.mcap --every 5
     segfloor view / --live
     """
-    folder = Path(options.input)
+    folder = user_path(options.input)
+    has_results = not live and (folder / 'summary.json').is_file()
+    source = None
+    if not (live or has_results):  # what cannot be read ends before a window is opened
+        source = open_source(options.configuration().stereo_camera)
     with open_view(str(out or ''), [options.input, options.params]) as shown:
         assert shown is not None
         if live:
             with terminal.needing_ros('--live'):
                 from segfloor_ros.apps.cli.replay_recorder import watch
             watch(shown, options.input)
-        elif (folder / 'summary.json').is_file():
+        elif source is None:
             show_results(shown, folder)
         else:
-            show_recording(shown, open_source(options.configuration().stereo_camera))
+            show_recording(shown, source)
 
 
 @terminal.with_options
