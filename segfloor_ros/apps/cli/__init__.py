@@ -2,6 +2,7 @@
 
 import sys
 
+import segfloor_ros
 from segfloor_ros.core.threads import limit_threads
 
 limit_threads()
@@ -9,9 +10,12 @@ limit_threads()
 
 def start() -> None:
     """Run the command line; without its libraries, end with one line and status 2."""
+    if sys.argv[1:] == ['--version']:  # also where nothing else is installed
+        print(f'segfloor_ros {segfloor_ros.__version__}')
+        return
     try:
         from segfloor_ros.apps.cli.main import main as run
-        from segfloor_ros.core.files.images import own_standard_error
+        from segfloor_ros.core.standard_error import own_standard_error
     except ModuleNotFoundError as error:
         if (error.name or '').startswith('segfloor_ros'):
             raise
