@@ -294,7 +294,17 @@ def _environment() -> dict[str, str]:
 
 def test_the_command_starts_without_libraries_that_few_of_its_parts_need() -> None:
     """Each takes a part of a second, in every process of a suite, too."""
-    heavy = {'matplotlib', 'evo', 'mujoco', 'distributed', 'rerun'}
+    heavy = {
+        'matplotlib',
+        'evo',
+        'mujoco',
+        'distributed',
+        'rerun',
+        'junitparser',
+        'scipy',
+        'cv2',
+        'numpy',
+    }
     words = f'import sys, segfloor_ros.apps.cli.main; print(sorted({heavy} & sys.modules.keys()))'
     found = subprocess.run([sys.executable, '-c', words], capture_output=True, text=True)
     assert found.stdout.strip() == '[]', found.stderr

@@ -15,7 +15,8 @@ from rich.table import Table
 
 from segfloor_ros.apps.cli import terminal as options
 from segfloor_ros.apps.cli.main import run_command
-from segfloor_ros.apps.cli.terminal import announcing, console, figure_table
+from segfloor_ros.apps.cli.printing import console
+from segfloor_ros.apps.cli.terminal import announcing, figure_table
 from segfloor_ros.nodes.configuration import resolve
 from tools.disparity_choices import DisparityScore, choices, read_pairs, score
 from tools.floor_masks import (

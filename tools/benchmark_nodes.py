@@ -15,7 +15,7 @@ from rich.table import Table
 from segfloor_ros.apps.cli import terminal as options
 from segfloor_ros.apps.cli.evaluate import print_node_figures
 from segfloor_ros.apps.cli.main import run_command
-from segfloor_ros.apps.cli.terminal import console
+from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.nodes.configuration import resolve
 from tools.endless_drive import write_endless_drive

@@ -27,7 +27,8 @@ from segfloor_ros.apps.benchmark import (
 from segfloor_ros.apps.cli import terminal as options
 from segfloor_ros.apps.cli.evaluate import stage_table, workload_table
 from segfloor_ros.apps.cli.main import run_command
-from segfloor_ros.apps.cli.terminal import Announce, announcing, console, figure_table
+from segfloor_ros.apps.cli.printing import console
+from segfloor_ros.apps.cli.terminal import Announce, announcing, figure_table
 from segfloor_ros.apps.evaluation.map_score import (
     MapScore,
     RoadMapPlan,

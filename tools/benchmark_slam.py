@@ -14,7 +14,8 @@ from rich.table import Table
 
 from segfloor_ros.apps.cli import terminal as options
 from segfloor_ros.apps.cli.main import run_command
-from segfloor_ros.apps.cli.terminal import Announce, announcing, console, figure_table
+from segfloor_ros.apps.cli.printing import console
+from segfloor_ros.apps.cli.terminal import Announce, announcing, figure_table
 from segfloor_ros.apps.trajectory import read_trajectory
 from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.plugins.assembly import make_pipeline

@@ -14,7 +14,8 @@ from typing import Annotated, Optional
 import typer
 
 from segfloor_ros.apps.cli.main import run_command
-from segfloor_ros.apps.cli.terminal import announcing, console, figure_table
+from segfloor_ros.apps.cli.printing import console
+from segfloor_ros.apps.cli.terminal import announcing, figure_table
 from segfloor_ros.apps.simulation.scene_file import open_scene, shipped
 from segfloor_ros.apps.simulation.simulation import RecordingOptions, render_once
 from segfloor_ros.apps.suite.job import ProgramError, run_segfloor

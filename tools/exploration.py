@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import typer
 
-from segfloor_ros.apps.cli.terminal import console
+from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.core.files.whole import read_json
 
 CAMERA = ('kind=realsense', 'width=480', 'height=360', 'rate_hz=3')

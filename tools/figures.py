@@ -21,7 +21,8 @@ from scipy.optimize import minimize_scalar
 
 from segfloor_ros import __version__
 from segfloor_ros.apps.cli.main import run_app
-from segfloor_ros.apps.cli.terminal import announcing, console
+from segfloor_ros.apps.cli.printing import console
+from segfloor_ros.apps.cli.terminal import announcing
 from segfloor_ros.apps.evaluation.floor import score_floor_folders
 from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.apps.simulation.scene_file import open_scene

@@ -35,7 +35,7 @@ from rich.console import Console
 from rich.table import Table
 
 from segfloor_ros.apps.cli.main import main as segfloor
-from segfloor_ros.core.files.images import own_standard_error
+from segfloor_ros.core.standard_error import own_standard_error
 from tools.fuzz_damages import DAMAGES
 from tools.fuzz_inputs import KINDS, files_of, words_of
 

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.apps.benchmark import CAMERA, MOUNT, CorridorImages
-from segfloor_ros.apps.cli.main import app
+from segfloor_ros.apps.cli.main import program
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.bag_writer import convert
 from segfloor_ros.apps.recordings.calibration_files import write_ros_calibration
@@ -254,7 +254,7 @@ def make_params(folder: Path) -> None:
 
 
 def _run(folder: Path, *words: str) -> None:
-    app(['run', str(folder / NAME), *MOUNTED, *words], standalone_mode=False)
+    program(['run'])(['run', str(folder / NAME), *MOUNTED, *words], standalone_mode=False)
 
 
 def make_saved_map(folder: Path) -> None:
@@ -326,7 +326,7 @@ def make_suite(folder: Path) -> None:
     _write(folder / 'suite.yaml', yaml.safe_dump(suite))
     words = ['check', str(folder / 'suite.yaml'), '--out', str(folder / 'out')]
     words += ['--write-baseline', str(folder / 'baseline.json'), '--cache', str(folder / 'cache')]
-    app(words, standalone_mode=False)
+    program(words)(words, standalone_mode=False)
 
 
 def make_scene(folder: Path) -> None:

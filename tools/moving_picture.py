@@ -20,7 +20,7 @@ from PIL import Image
 from rich.progress import track
 
 from segfloor_ros.apps.cli.main import run_command
-from segfloor_ros.apps.cli.terminal import console
+from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, FloorObservation, Keyframe
 from segfloor_ros.core.errors import InputError

@@ -18,7 +18,8 @@ import typer
 from numpy.typing import NDArray
 
 from segfloor_ros.apps.cli.main import run_command
-from segfloor_ros.apps.cli.terminal import announcing, console, figure_table
+from segfloor_ros.apps.cli.printing import console
+from segfloor_ros.apps.cli.terminal import announcing, figure_table
 from segfloor_ros.apps.evaluation.map_score import score_map
 from segfloor_ros.apps.evaluation.maps import load_truth
 from segfloor_ros.apps.simulation.scene_file import open_scene

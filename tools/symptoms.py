@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from segfloor_ros.apps.cli.main import run_command
-from segfloor_ros.apps.cli.terminal import announcing, console
+from segfloor_ros.apps.cli.printing import console
+from segfloor_ros.apps.cli.terminal import announcing
 from segfloor_ros.apps.evaluation.map_score import compare, draw_overlay
 from segfloor_ros.apps.evaluation.maps import load_truth
 from segfloor_ros.apps.map_files import load_map

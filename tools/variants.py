@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from segfloor_ros.apps.cli.main import run_command
-from segfloor_ros.apps.cli.terminal import console
+from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.apps.evaluation.floor import (
     FloorScore,
     count_pixels,

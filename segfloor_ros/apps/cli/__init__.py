@@ -1,7 +1,9 @@
 """The segfloor command."""
 
+import os
 import sys
 
+import segfloor_ros
 from segfloor_ros.core.starting import (
     end_in_silence_on_signals,
     limit_threads,
@@ -15,9 +17,11 @@ def start() -> None:
     """Run the command line; without its libraries, end with one line and status 2."""
     open_standard_streams()
     end_in_silence_on_signals()
+    if sys.argv[1:] == ['--version']:  # also where nothing else is installed
+        return _print_version()
     try:
         from segfloor_ros.apps.cli.main import main as run
-        from segfloor_ros.core.files.images import own_standard_error
+        from segfloor_ros.core.standard_error import own_standard_error
     except ModuleNotFoundError as error:
         if (error.name or '').startswith('segfloor_ros'):
             raise
@@ -31,3 +35,11 @@ def start() -> None:
         sys.exit(2)
     own_standard_error()
     run()
+
+
+def _print_version() -> None:
+    try:
+        print(f'segfloor_ros {segfloor_ros.__version__}', flush=True)
+    except OSError as error:
+        sys.stderr.write(f'segfloor: standard output: {error.strerror}\n')
+        os._exit(1)

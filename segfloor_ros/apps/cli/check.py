@@ -13,7 +13,8 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from segfloor_ros.apps.cli.terminal import View, console, figure_table, number_option, print_error
+from segfloor_ros.apps.cli.printing import console, print_error
+from segfloor_ros.apps.cli.terminal import View, figure_table, number_option
 from segfloor_ros.apps.cli.view import open_view, show_results
 from segfloor_ros.apps.results_folder import OUTPUT_NAMES
 from segfloor_ros.apps.suite.description import Suite, read_suite
@@ -90,6 +91,9 @@ def check_suite(
     segfloor check suite.yaml --out checked --jobs 4
     segfloor check suites/euroc.yaml --data ~/euroc --out checked
     """
+    # Imported here: without junitparser nothing is mapped.
+    import segfloor_ros.apps.suite.junit  # noqa: F401
+
     described = read_suite(suite, data)
     for name in described.missing:
         print_error(f'{name}: is not in {data}, skipped')
@@ -207,7 +211,8 @@ def _pose(values: Any) -> Pose2d | None:
 def _finish(result: SuiteResult, out: Path, described: Suite, baseline: Baseline | None) -> None:
     """Print the table and what fails, and write the files of the suite."""
     # Imported here: Matplotlib takes a second that other commands should not wait for.
-    from segfloor_ros.apps.suite.result_files import junit, page
+    from segfloor_ros.apps.suite.junit import junit
+    from segfloor_ros.apps.suite.result_files import page
 
     console.print(_table(result, described))
     for checked in result.recordings:

@@ -16,7 +16,8 @@ from rich.table import Table
 
 from segfloor_ros.apps.cli import terminal
 from segfloor_ros.apps.cli.evaluate import map_table
-from segfloor_ros.apps.cli.terminal import DriveOptions, console, number_option
+from segfloor_ros.apps.cli.printing import console
+from segfloor_ros.apps.cli.terminal import DriveOptions, ExploreOptions, number_option
 from segfloor_ros.apps.cli.view import open_view
 from segfloor_ros.apps.evaluation.map_score import compare, overlay_png, score_map
 from segfloor_ros.apps.evaluation.maps import load_truth
@@ -307,33 +308,6 @@ def simulate(
             f'{simulation.frame_count} pairs, {simulation.drive.length_m:.1f} m, {seconds:.0f} s'
         )
     console.print(f'{facts}: {out}')
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ExploreOptions:
-    """What is explored, by which robot, and how far."""
-
-    scene: terminal.Scene
-    out: terminal.Out
-    robot: Annotated[str, typer.Option(help='The robot: turtlebot3_burger or husky.')] = (
-        'turtlebot3_burger'
-    )
-    goals: Annotated[int, number_option('Goals to draw at random and to drive to.', 0)] = 5
-    seed: Annotated[int, number_option('Of the goals, the textures and the noise.', 0)] = 1
-    goal: Annotated[
-        list[str] | None,
-        typer.Option(
-            help='Drive to this place and explore nothing: a name in goals.yaml of --start-in, or '
-            'X,Y in its map; repeatable.'
-        ),
-    ] = None
-    start_in: Annotated[
-        Path | None, typer.Option(help='Start in the map of this earlier exploration, be found.')
-    ] = None
-    minutes: Annotated[float, number_option("At most so long, in the robot's time.", 0.1)] = 30.0
-    depth: terminal.Depth = False
-    set_values: terminal.SceneValues = None
-    params: terminal.Params = None
 
 
 @terminal.with_options

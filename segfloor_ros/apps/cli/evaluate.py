@@ -23,12 +23,12 @@ from segfloor_ros.apps.benchmark import (
     run_benchmark,
 )
 from segfloor_ros.apps.cli import terminal
+from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.apps.cli.terminal import (
     Json,
     Params,
     Set,
     announcing,
-    console,
     figure_table,
     needing_ros,
     number_option,

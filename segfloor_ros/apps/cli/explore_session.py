@@ -23,10 +23,10 @@ from geometry_msgs.msg import Twist, TwistStamped, Vector3
 from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool, Trigger
 
-from segfloor_ros.apps.cli.commands import ExploreOptions
+from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.apps.cli.replay_nodes import STALL_S, NodeGraph, ReplayError, running_nodes
 from segfloor_ros.apps.cli.replay_session import cpu_s
-from segfloor_ros.apps.cli.terminal import console, progress_bar, value_table
+from segfloor_ros.apps.cli.terminal import ExploreOptions, progress_bar, value_table
 from segfloor_ros.apps.evaluation.exploration import (
     Exploration,
     Moment,

@@ -15,7 +15,8 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from segfloor_ros.apps.cli.terminal import Json, console, print_json, value_table
+from segfloor_ros.apps.cli.printing import console
+from segfloor_ros.apps.cli.terminal import Json, print_json, value_table
 from segfloor_ros.apps.evaluation.maps import resample
 from segfloor_ros.apps.label_files import draw_labels, filter_mask, save_labels
 from segfloor_ros.core.contracts import KeyframePath, SparseCloud

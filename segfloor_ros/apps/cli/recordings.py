@@ -21,8 +21,9 @@ from segfloor_ros.apps.calibration import (
     calibrate_folder,
     check_recording,
 )
-from segfloor_ros.apps.cli import terminal
-from segfloor_ros.apps.cli.terminal import console, figure_table, number_option, value_table
+from segfloor_ros.apps.cli import printing, terminal
+from segfloor_ros.apps.cli.printing import console
+from segfloor_ros.apps.cli.terminal import figure_table, number_option, value_table
 from segfloor_ros.apps.cli.view import open_view, show_recording, show_results
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.bag_writer import BagWriter, ImageCoding, NewBag
@@ -170,7 +171,7 @@ def _record_topics(out: Path, topics: str | None, seconds: float, interrupt: Int
 
     with (
         NewBag(out, keeps=True) as bag,
-        terminal.error_console.status('waiting for topics') as status,
+        printing.error_console.status('waiting for topics') as status,
     ):
         records, is_full = record_topics(bag, topics, seconds, interrupt, show)
         if not any(record.messages for record in records.values()):
@@ -318,7 +319,7 @@ def calibrate(
     with terminal.progress_bar('searching boards', None) as progress:
         result = calibrate_folder(folder, pattern, out, progress)
     if result.left_out:
-        terminal.print_error(f'{folder}: left out: {result.left_out}')
+        printing.print_error(f'{folder}: left out: {result.left_out}')
     _print_calibration(result, out or folder)
 
 
@@ -367,6 +368,6 @@ def _check_calibration(source: StereoSource, board: Board | None) -> None:
     figures += [] if board is None else [('first to last corner of the board', length)]
     console.print(value_table('calibration', figures, source.name))
     for fault in found.faults:
-        terminal.print_error(fault.line())
+        printing.print_error(fault.line())
     if found.faults:
         raise typer.Exit(1)

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import typer
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -24,9 +23,9 @@ from rich.progress import (
 )
 from rich.progress import Progress as ProgressBar
 from rich.table import Table
-from rich.text import Text
 
 import segfloor_ros
+from segfloor_ros.apps.cli.printing import console, error_console, print_error
 from segfloor_ros.apps.lockstep import MapOptions, SaveMasks
 from segfloor_ros.apps.recordings import StereoSource, open_source
 from segfloor_ros.apps.results_folder import (
@@ -39,22 +38,10 @@ from segfloor_ros.apps.results_folder import (
 )
 from segfloor_ros.core.camera.recording import RecordedSensor
 from segfloor_ros.core.configuration import Configuration
-from segfloor_ros.core.errors import SettingsError, printable
+from segfloor_ros.core.errors import SettingsError
 from segfloor_ros.core.processes import Interrupt
 from segfloor_ros.core.settings import suggestion
 from segfloor_ros.nodes.configuration import resolve
-
-
-class PlainConsole(Console):
-    """A console that passes no control characters of names on to the terminal."""
-
-    def render_str(self, text: str, **options: Any) -> Text:
-        """Return a text as it is shown."""
-        return super().render_str('\n'.join(map(printable, text.split('\n'))), **options)
-
-
-console = PlainConsole(markup=False, highlight=False)
-error_console = PlainConsole(stderr=True, soft_wrap=True, markup=False, highlight=False)
 
 Progress = Callable[..., None]
 """Told how many steps are done and, as `note`, the state in words."""
@@ -132,11 +119,6 @@ def print_summary(title: str, summary: RunSummary) -> None:
 def print_json(document: Mapping[str, Any]) -> None:
     """Print figures as JSON."""
     typer.echo(json.dumps(document, indent=2))
-
-
-def print_error(message: str) -> None:
-    """Print one line on standard error."""
-    error_console.print(f'segfloor: {printable(message)}')
 
 
 def end_if_interrupted(interrupt: Interrupt) -> None:
@@ -410,3 +392,30 @@ def configuration(
         if value is not None and value is not False
     }
     return resolve(params, assignments or (), stereo_camera={'input': input, **given})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExploreOptions:
+    """What is explored, by which robot, and how far."""
+
+    scene: Scene
+    out: Out
+    robot: Annotated[str, typer.Option(help='The robot: turtlebot3_burger or husky.')] = (
+        'turtlebot3_burger'
+    )
+    goals: Annotated[int, number_option('Goals to draw at random and to drive to.', 0)] = 5
+    seed: Annotated[int, number_option('Of the goals, the textures and the noise.', 0)] = 1
+    goal: Annotated[
+        list[str] | None,
+        typer.Option(
+            help='Drive to this place and explore nothing: a name in goals.yaml of --start-in, or '
+            'X,Y in its map; repeatable.'
+        ),
+    ] = None
+    start_in: Annotated[
+        Path | None, typer.Option(help='Start in the map of this earlier exploration, be found.')
+    ] = None
+    minutes: Annotated[float, number_option("At most so long, in the robot's time.", 0.1)] = 30.0
+    depth: Depth = False
+    set_values: SceneValues = None
+    params: Params = None

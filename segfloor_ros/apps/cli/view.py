@@ -19,7 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.apps.cli.terminal import console, progress_bar
+from segfloor_ros.apps.cli.printing import SUFFIX, console
+from segfloor_ros.apps.cli.terminal import progress_bar
 from segfloor_ros.apps.label_files import class_colours, draw_labels
 from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.ply import read_ply
@@ -56,8 +57,6 @@ from segfloor_ros.core.grid.occupancy import UNKNOWN_PIXEL, OccupancyGrid
 from segfloor_ros.core.pipeline import Pipeline
 from segfloor_ros.core.plugins.semantics.outputs import UNLABELLED
 from segfloor_ros.nodes.configuration import resolve
-
-SUFFIX = '.rrd'
 
 WEB_PORT = 9090
 """Where the page for the browser is served, on this machine."""

@@ -24,7 +24,6 @@ from segfloor_ros.apps.evaluation.report_pictures import (
     read_run,
     v_disparity_picture,
 )
-from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.apps.results_folder import REPORT, SEMANTIC, STAGE_COLUMNS, stage_rows
 from segfloor_ros.core.errors import os_errors
 from segfloor_ros.core.files.whole import read_bytes
@@ -180,6 +179,9 @@ def _scores(data: ReportData) -> str:
         return ''
     facts = _map_facts(score_map(data.grid, data.truth))
     if data.truth_folder is not None and (data.truth_folder / 'poses.txt').is_file():
+        # Imported here: evo is needed for this alone.
+        from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
+
         path = score_trajectory(match_files(data.folder, data.truth_folder))
         facts.append((f'{path.ate_rmse_m:.3f} m', f'path error over {path.path_length_m:.1f} m'))
     return '<h2>Against the truth</h2>' + _fact_row(facts)

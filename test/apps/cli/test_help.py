@@ -11,7 +11,7 @@ import typer
 from command_line import segfloor
 from rich.text import Text
 
-from segfloor_ros.apps.cli.main import app
+from segfloor_ros.apps.cli.main import COMMANDS, program
 from segfloor_ros.apps.cli.terminal import params_file, shipped_params
 from segfloor_ros.nodes.configuration import resolve
 
@@ -24,7 +24,7 @@ def commands(group, name=''):
         yield from commands(command, words)
 
 
-ALL = dict(commands(typer.main.get_command(app)))
+ALL = dict(commands(typer.main.get_command(program())))
 SINGLE = {name: command for name, command in ALL.items() if not hasattr(command, 'commands')}
 
 
@@ -33,6 +33,12 @@ def test_no_word_of_a_help_is_taken_for_markup(name):
     for parameter in ALL[name].params:
         words = getattr(parameter, 'help', None) or ''
         assert Text.from_markup(words).plain == words, parameter.name
+
+
+@pytest.mark.parametrize('name', COMMANDS)
+def test_a_command_is_described_in_the_words_of_its_own_help(name):
+    own = ' '.join(ALL[name].help.partition('\n\n')[0].split())
+    assert COMMANDS[name][1] == own
 
 
 @pytest.mark.parametrize('name', SINGLE)

@@ -7,6 +7,7 @@ import pytest
 from junitparser import JUnitXml
 
 from segfloor_ros.apps.suite.job import Outcome
+from segfloor_ros.apps.suite.junit import junit
 from segfloor_ros.apps.suite.measures import (
     Bound,
     Slack,
@@ -19,7 +20,7 @@ from segfloor_ros.apps.suite.measures import (
     read_baseline,
     write_baseline,
 )
-from segfloor_ros.apps.suite.result_files import junit, page
+from segfloor_ros.apps.suite.result_files import page
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from segfloor_ros.nodes.map_files import save_map

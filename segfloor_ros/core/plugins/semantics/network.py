@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from segfloor_ros.core.camera.pixels import union
 from segfloor_ros.core.contracts import FLOOR, MOVING, NO_EVIDENCE, NOT_FLOOR, StereoFrame
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.files.images import silent_libraries
 from segfloor_ros.core.plugins.moving.scene_flow import MAX_MOVING_SHARE
 from segfloor_ros.core.plugins.semantics.outputs import KINDS, UNLABELLED, Segments
+from segfloor_ros.core.standard_error import silent_libraries
 from segfloor_ros.core.timing import StageTimes
 
 Run = Callable[[NDArray[np.float32]], list[NDArray[Any]]]
