@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from segfloor_ros.core.starting import limit_threads
+from segfloor_ros.core.threads import limit_threads
 
 # Message fields of a wrong type must fail instead of being sent as garbage; read on import.
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'

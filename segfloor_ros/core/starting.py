@@ -7,22 +7,7 @@ import signal
 import sys
 from types import FrameType
 
-BLAS_VARIABLES = 'OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'
-
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
-
-def limit_threads() -> None:
-    """Use one thread of BLAS whatever the environment says, since the number of threads changes the
-    last digits of a result, and one of OpenCV unless the environment says otherwise; call it before
-    they are imported.
-
-    Matrices and images here are small: a second thread gains little on an idle machine, costs CPU
-    time while it waits for work, and on a busy one the two wait for each other. The stages run side
-    by side instead.
-    """
-    os.environ.update(dict.fromkeys(BLAS_VARIABLES, '1'))
-    os.environ.setdefault('OPENCV_FOR_THREADS_NUM', '1')
 
 
 def end_in_silence_on_signals(status: int | None = None) -> None:

@@ -5,6 +5,6 @@ The way in is one module per node; `shared` is what they have in common, `slam_*
 `stereo_slam`.
 """
 
-from segfloor_ros.core.starting import limit_threads
+from segfloor_ros.core.threads import limit_threads
 
 limit_threads()

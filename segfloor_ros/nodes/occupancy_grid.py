@@ -10,7 +10,7 @@ from rclpy.timer import Timer
 
 from segfloor_ros.core.errors import MapError, SettingsError
 from segfloor_ros.core.files.arrays import MapFile
-from segfloor_ros.core.files.whole import user_path
+from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.grid.mapper import OccupancyGridMapper
 from segfloor_ros.nodes.messages.grids import grid_message
 from segfloor_ros.nodes.messages.points import features_arrays, labelled_arrays

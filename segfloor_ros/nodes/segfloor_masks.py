@@ -14,7 +14,7 @@ from std_msgs.msg import String
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import KeyframePath, Mount
-from segfloor_ros.core.files.whole import user_path
+from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.plugins.semantics.label_map import LabelMap, numbered
 from segfloor_ros.core.plugins.semantics.network import ImageLabeller, NetworkSettings
 from segfloor_ros.nodes.messages.colours import colour8_image

@@ -22,9 +22,9 @@ from std_msgs.msg import UInt8MultiArray
 from segfloor_ros.core.camera.calibration import StereoCalibration
 from segfloor_ros.core.camera.pixels import Region, shrink_factor, shrunk_camera, shrunk_image
 from segfloor_ros.core.contracts import FrameResult, Keyframe, LoadedMap, Mount, StereoFrame
-from segfloor_ros.core.errors import MapError, SegfloorError, SettingsError
+from segfloor_ros.core.errors import MapError, SettingsError
 from segfloor_ros.core.files.arrays import MapFile
-from segfloor_ros.core.files.whole import user_path
+from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
@@ -469,21 +469,20 @@ class SlamMaps:
         has_map = slam is not None and slam.mount is not None and bool(slam.map.keyframes)
         if not (self._own.save_map and has_map) or self._own.localize or self._arrived is not None:
             return
-        log = self._node.get_logger()
-        try:
-            path, saved = self._begin_to_save()
-        except (SegfloorError, OSError) as error:
-            log.error(f'the map is not saved before the reset: {error}')
-            return
+        node, log_fault = self._node, self._node.reporter.log_fault
 
-        async def complete() -> None:
+        async def complete(path: Path, saved: MapFile) -> None:
             try:
-                log.warning(f'the map before the reset is in {await self._completed(path, saved)}')
-            except (SegfloorError, OSError) as error:
-                log.error(f'the map before the reset is not saved: {error}')
+                place = await self._completed(path, saved)
+                node.get_logger().warning(f'the map before the reset is in {place}')
+            except Exception as error:
+                log_fault('save_map, before the reset', error)
 
-        assert self._node.executor is not None
-        self._node.executor.create_task(complete)
+        try:
+            assert node.executor is not None
+            node.executor.create_task(complete, *self._begin_to_save())
+        except Exception as error:
+            log_fault('save_map, before the reset', error)
 
     def _begin_to_save(self) -> tuple[Path, MapFile]:
         """Ask for the parts of the other nodes; returns where to save, and SLAM's own part."""

@@ -13,9 +13,9 @@ from segfloor_ros.nodes.messages.diagnostics import Level
 from segfloor_ros.nodes.messages.topics import FRAME_DONE, make_header
 from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import CHECK_S
-from segfloor_ros.nodes.shared.joining import InTime, StampOrder
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
+from segfloor_ros.nodes.shared.stamp_order import InTime, StampOrder
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.nodes.slam_camera import Pair, StereoInput
 from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamMaps, SlamResults

@@ -26,7 +26,7 @@ from segfloor_ros.nodes.messages.points import labelled_arrays
 from segfloor_ros.nodes.messages.poses import transform_array
 from segfloor_ros.nodes.messages.topics import MAP_START, TOPICS, to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
-from segfloor_ros.nodes.shared.joining import AGREEING
+from segfloor_ros.nodes.shared.stamp_order import AGREEING
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 S = 1_000_000_000

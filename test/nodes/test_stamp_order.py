@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from segfloor_ros.nodes.shared.joining import AGREEING, InTime, StampOrder
+from segfloor_ros.nodes.shared.stamp_order import AGREEING, InTime, StampOrder
 
 S = 1_000_000_000
 WRONG = [0, -5 * S, 99 * S, (2**31 - 2) * S, 103 * S]

@@ -12,7 +12,7 @@ from test_saved_maps import LISTENED, PARAMETERS, Chain, last_keyframe
 
 from segfloor_ros.core.files.results import read_map_file
 from segfloor_ros.nodes.messages.poses import pose_message
-from segfloor_ros.nodes.shared.joining import AGREEING
+from segfloor_ros.nodes.shared.stamp_order import AGREEING
 
 S = 1_000_000_000
 SHIFT_NS = 100 * S

@@ -4,11 +4,8 @@ import os
 import sys
 
 import segfloor_ros
-from segfloor_ros.core.starting import (
-    end_in_silence_on_signals,
-    limit_threads,
-    open_standard_streams,
-)
+from segfloor_ros.core.starting import end_in_silence_on_signals, open_standard_streams
+from segfloor_ros.core.threads import limit_threads
 
 limit_threads()
 

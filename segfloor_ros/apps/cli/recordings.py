@@ -33,8 +33,8 @@ from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.apps.results_folder import read_summary
 from segfloor_ros.core.camera.recording import DEPTH
 from segfloor_ros.core.errors import InputError, SettingsError, os_errors
+from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.files.results import is_map_file
-from segfloor_ros.core.files.whole import user_path
 from segfloor_ros.core.files.writing import write_output
 from segfloor_ros.core.plugins.rig.check import SETTLED_FRAMES
 from segfloor_ros.core.processes import Interrupt, first_interrupt_noted

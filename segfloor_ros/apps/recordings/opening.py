@@ -43,7 +43,8 @@ from segfloor_ros.core.camera.images import to_grey
 from segfloor_ros.core.camera.pixels import Grey
 from segfloor_ros.core.camera.recording import RecordedSensor, StereoCameraSettings
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.files.whole import check_file, user_path
+from segfloor_ros.core.files.paths import user_path
+from segfloor_ros.core.files.whole import check_file
 from segfloor_ros.core.plugins.rig.check import BURST, RigCheck
 from segfloor_ros.core.standard_error import silent_libraries
 

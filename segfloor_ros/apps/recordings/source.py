@@ -26,7 +26,8 @@ from segfloor_ros.core.camera.rectification import StereoRectifier
 from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.errors import CalibrationError, CorruptImageError, InputError
 from segfloor_ros.core.files.images import check_same_size, read_mask
-from segfloor_ros.nodes.shared.joining import AGREEING, InTime, Stamped, StampJoiner, StampOrder
+from segfloor_ros.nodes.shared.joining import Stamped, StampJoiner
+from segfloor_ros.nodes.shared.stamp_order import AGREEING, InTime, StampOrder
 
 PLAUSIBLE_HZ = 0.1, 1000.0
 """Pairs per second of a robot's camera; others come of times in another unit."""

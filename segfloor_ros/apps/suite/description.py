@@ -11,8 +11,8 @@ from typing import Any
 from segfloor_ros.apps.suite.measures import HIGHER, LOWER, MEASURES, Bound, Slack
 from segfloor_ros.apps.suite.result_files import find_recordings, is_url
 from segfloor_ros.core.errors import SegfloorError, SettingsError
+from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.files.whole import number as finite_number
-from segfloor_ros.core.files.whole import user_path
 from segfloor_ros.core.settings import suggestion
 from segfloor_ros.nodes.configuration import resolve
 from segfloor_ros.nodes.yaml_files import Key, MarkedYaml, read_marked_yaml

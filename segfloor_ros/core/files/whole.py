@@ -27,18 +27,6 @@ END_NS = 2**31 * 10**9
 _NUMBER = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?', re.ASCII)
 
 
-def user_path(name: str | Path, error_type: type[SegfloorError] = InputError) -> Path:
-    """Return the path of a name that a user gives, with `~` and `~user` for home folders. Raises an
-    error of a type for a name that cannot be one.
-    """
-    if '\0' in str(name):
-        raise error_type(f'{name}: a name holds no null character')
-    try:
-        return Path(name).expanduser()
-    except RuntimeError:
-        raise error_type(f'{name}: there is no such user; write the whole path') from None
-
-
 def check_file(path: Path, error_type: type[SegfloorError] = InputError) -> int:
     """Return the size of a file in bytes. Raises an error of a type for what is missing, a folder,
     a FIFO or a device: reading one of these may never end.
