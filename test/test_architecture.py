@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from segfloor_ros.apps.programs import APPS
+from tools import closure as closures
+from tools.closure import circles, closure
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'segfloor_ros'
 MODULES = sorted(PACKAGE.rglob('*.py'))
@@ -34,8 +36,24 @@ ONLY_IN = {
     'rerun': ('apps.cli',),
     'onnxruntime': ('core.plugins.semantics',),
 }
-FLOW = ('camera', 'slam', 'floor', 'cloud', 'grid')
-"""Data flows one way: a stage may know the data of the stages before it, not of those behind it."""
+STAGES = ('slam', 'floor', 'cloud', 'grid')
+"""Data flows from left to right; what passes between them is in `core.contracts`."""
+
+CEILINGS = {
+    'core.pipeline': 9450,
+    'core.slam.stereo_slam': 6050,
+    'core.floor.segmentation': 2800,
+    'core.cloud': 750,
+    'core.grid.mapper': 1400,
+    'nodes.stereo_camera': 3750,
+    'nodes.stereo_slam': 9950,
+    'nodes.floor_segmentation': 5000,
+    'nodes.cloud_labelling': 3050,
+    'nodes.occupancy_grid': 3400,
+    'apps.cli.main': 400,
+}
+"""Code lines that a reader must load to understand a module (`tools.closure`). They may only fall:
+a feature that does not fit is a plug-in, or belongs to another storey."""
 
 
 def is_ros(name: str) -> bool:
@@ -86,13 +104,47 @@ def test_a_module_keeps_to_the_rules(path) -> None:
         assert tops <= CORE_USES
 
 
-@pytest.mark.parametrize('room', FLOW)
-def test_a_stage_knows_nothing_of_the_stages_behind_it(room) -> None:
-    behind = FLOW[FLOW.index(room) + 1 :]
+@pytest.mark.parametrize('stage', STAGES)
+def test_a_stage_imports_neither_other_stages_nor_plugins(stage) -> None:
+    others = [f'core.{room}' for room in (*STAGES, 'plugins', 'pipeline') if room != stage]
     for path in MODULES:
-        if is_in(name_of(path), f'core.{room}'):
-            found = {n for n in imported_modules(path) for b in behind if is_in(n, f'core.{b}')}
+        if is_in(name_of(path), f'core.{stage}'):
+            found = {n for n in imported_modules(path) for other in others if is_in(n, other)}
             assert not found, path.relative_to(PACKAGE)
+
+
+def test_plugins_are_imported_by_no_part_of_the_core() -> None:
+    for path in MODULES:
+        name = name_of(path)
+        if is_in(name, 'core') and not is_in(name, 'core.plugins'):
+            assert not [n for n in imported_modules(path) if is_in(n, 'core.plugins')], name
+
+
+def test_no_modules_import_one_another_in_a_circle() -> None:
+    assert not circles()
+
+
+@pytest.mark.parametrize('entry', CEILINGS)
+def test_what_a_reader_must_load_only_shrinks(entry) -> None:
+    assert sum(closure(entry).values()) <= CEILINGS[entry]
+
+
+def test_a_closure_holds_imports_for_types_but_not_those_of_functions(
+    tmp_path, monkeypatch
+) -> None:
+    package = tmp_path / 'segfloor_ros'
+    package.mkdir()
+    (package / '__init__.py').write_text('"""Nothing."""\n')
+    (package / 'a.py').write_text(
+        'from typing import TYPE_CHECKING\n\n# A comment.\nif TYPE_CHECKING:\n'
+        '    from segfloor_ros import b\n\n\ndef f():\n    import segfloor_ros.c\n'
+    )
+    (package / 'b.py').write_text('import segfloor_ros.a\n\nB = 1\n')
+    (package / 'c.py').write_text('C = 1\n')
+    monkeypatch.setattr(closures, 'PACKAGE', package)
+    monkeypatch.setattr(closures, 'imported_by', closures.imported_by.__wrapped__)
+    assert closure('a') == {'segfloor_ros': 0, 'segfloor_ros.a': 5, 'segfloor_ros.b': 2}
+    assert circles() == [{'segfloor_ros.a', 'segfloor_ros.b'}]
 
 
 def test_ros_in_the_apps_is_for_nodes_replay_recorder_and_exploration_alone() -> None:

@@ -3,7 +3,7 @@
 The published method takes the label from the mask at the latest look. Here every look counts:
 log-odds per point, negative for floor and positive for an obstacle, from the mask and from the
 height above the local floor. They are kept in the order of the cloud's ids. The grid gets the
-sparse cloud with a label per point; a PLY file (binary, little endian) holds the same.
+sparse cloud with a label per point.
 """
 
 from __future__ import annotations

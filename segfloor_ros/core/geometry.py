@@ -1,9 +1,7 @@
-"""Rigid motions and axes shared by all stages, and the tree of frames that tf messages describe.
+"""Rigid motions and axes shared by all stages.
 
 `T_a_b` is a (4, 4) float64 matrix that maps points of frame b into frame a. Optical frames have
 x right, y down, z forward; ROS frames have x forward, y left, z up (REP-103).
-
-SciPy is imported where it is used: it takes 20 MB of every process, and not all need it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""This process and those it starts: how they end, in order, and how many threads they use."""
+"""This process and those it starts: how they end, in order."""
 
 from __future__ import annotations
 

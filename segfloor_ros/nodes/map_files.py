@@ -1,4 +1,4 @@
-"""Map files as map_server and Nav2 read them: an image and a YAML file beside it."""
+"""Map files as map_server and Nav2 read them, written: an image and a YAML file beside it."""
 
 from __future__ import annotations
 

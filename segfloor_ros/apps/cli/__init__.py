@@ -1,4 +1,8 @@
-"""The segfloor command."""
+"""The `segfloor` command.
+
+In: the words of a command line. Out: files in a folder, tables, an exit status.
+The way in is `main`, which loads a command when it is called.
+"""
 
 import os
 import sys

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.apps.recordings import bag_file as bag_topics
+import segfloor_ros.apps.recordings.bag_file as bag_topics
 from segfloor_ros.apps.recordings.bag_file import BagFile, check_given, open_bag_file
 from segfloor_ros.apps.recordings.calibration_files import given_calibration, given_left_calibration
 from segfloor_ros.apps.recordings.files import (

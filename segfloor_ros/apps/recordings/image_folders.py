@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.apps.recordings import files
+import segfloor_ros.apps.recordings.files as files
 from segfloor_ros.apps.recordings.calibration_files import (
     KALIBR_NAMES,
     find_calibration,

@@ -1,4 +1,8 @@
-"""Verdicts as JUnit XML, for the services that show test results."""
+"""Verdicts as JUnit XML, for the services that show test results.
+
+It keeps to both schemas in use: that of Ant's JUnit task and the looser one of Jenkins's xUnit
+plugin.
+"""
 
 from __future__ import annotations
 

@@ -1,10 +1,6 @@
 """Results folders, packed to be sent, and kept by what they were made from; recordings by path,
-pattern or URL: found, copied to this machine, and told apart by content.
-
-A suite's results on one page, with links to the report of each recording, and as JUnit XML.
-
-The latter keeps to both schemas in use: that of Ant's JUnit task and the looser one of Jenkins's
-xUnit plugin.
+pattern or URL: found, copied to this machine, and told apart by content. A suite's results on one
+page, with links to the report of each recording.
 """
 
 from __future__ import annotations

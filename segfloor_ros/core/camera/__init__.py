@@ -1,5 +1,5 @@
-"""The stereo camera: its model, calibration, images and the recordings they come from.
+"""The stereo camera: its model, its calibration and rectification, and images as arrays.
 
-In: folders, bags, videos, devices, depth images. Out: stamped stereo frames of a known camera.
-The way in is `sources.open_source`; `calibration` measures and reads lenses and rectifies.
+In: raw images, calibrations, messages of sensors. Out: rectified stereo frames of a known camera.
+The way in is `rectification.StereoRectifier`; `model` is what all stages know of the camera.
 """

@@ -1,13 +1,7 @@
-"""Calibration of a stereo pair and of each of its cameras, and rectification by it: epipolar lines
-become rows.
+"""The calibration of a stereo pair and of each of its cameras.
 
 The fields of one camera are those of ROS calibration files and of `sensor_msgs/CameraInfo`, as
 arrays.
-
-The block grid of JPEG images is smoothed first. Where texture is weaker than the quantisation a
-block of 8 x 8 pixels becomes flat, and the steps between blocks are the strongest texture there is.
-They stand still in the image: a stereo matcher finds them at the one disparity at which the grids
-of both images coincide, however far away the surface is.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""The stereo camera: its settings, the rectified pair of pinholes and its place on the robot; and
-what the robot measures besides images, by stamp: wheel odometry and an IMU.
-"""
+"""The rectified stereo camera: a pair of pinholes, and the error that its disparities may share."""
 
 from __future__ import annotations
 

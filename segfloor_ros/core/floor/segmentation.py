@@ -1,7 +1,6 @@
 """The floor segmentation stage: a rectified stereo pair in, the floor out.
 
-What moves and the border that rectification leaves do not count. For people there are pictures of
-mask and v-disparity.
+What moves and the border that rectification leaves do not count.
 """
 
 from __future__ import annotations

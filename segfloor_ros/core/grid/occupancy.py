@@ -1,7 +1,6 @@
-"""The occupancy grid: its settings, its data, and map files as map_server and Nav2 read them, an
-image and a YAML file beside it.
+"""The occupancy grid: its settings, its data, and the evidence it is made of.
 
-Cells of evidence on an unbounded raster, and the grid that is published of them.
+Cells of evidence lie on an unbounded raster; the grid that is published is rendered from them.
 
 Evidence is kept in whole steps of `QUANTUM` log-odds, 128 steps above zero being 128 of uint8:
 integers, so that the same observations give the same cells on every machine.

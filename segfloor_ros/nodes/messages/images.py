@@ -1,7 +1,4 @@
-"""Arrays as messages: images, their calibrations and the floor seen in them (mask, disparity,
-scan); points as NumPy structured arrays (features, the sparse map, labelled points), the
-occupancy grid, saved maps or parts of one, and which map a keyframe belongs to.
-"""
+"""Images and disparities as messages, and out of them."""
 
 from __future__ import annotations
 

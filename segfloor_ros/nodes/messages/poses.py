@@ -1,6 +1,4 @@
-"""Poses, odometry, paths, transforms, wheels and IMU as messages. Quaternions are normalised on the
-way in.
-"""
+"""Poses, paths and transforms as messages. Quaternions are normalised on the way in."""
 
 from __future__ import annotations
 

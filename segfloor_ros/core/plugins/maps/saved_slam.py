@@ -1,8 +1,4 @@
-"""SLAM as a part of a saved map, and SLAM that goes on with one.
-
-Features that show no point are left out, and so are the motions that sensors measured; nothing is
-lost that tracking, relocalisation or the closing of loops need.
-"""
+"""SLAM as a part of a saved map, and SLAM that goes on with one."""
 
 from __future__ import annotations
 

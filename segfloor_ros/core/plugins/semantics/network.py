@@ -1,5 +1,5 @@
-"""A segmentation network in an ONNX file, with a YAML file beside it that says how to use it; and
-beside a drive, where it looks at each image once, on a thread of its own.
+"""A segmentation network in an ONNX file, and beside a drive, where it looks at each image once, on
+a thread of its own.
 """
 
 from __future__ import annotations
