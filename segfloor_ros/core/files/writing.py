@@ -241,6 +241,7 @@ def move_into_place(made: Path, target: Path) -> None:
     OSError, or InputError where a file of others is in the way; then nothing has changed.
     """
     new = {name: made / name for name in _files_in(made) if name != MARKER}
+    target.mkdir(exist_ok=True)
     _replace_files(target, new, is_all=True)
 
 
