@@ -12,11 +12,11 @@ from segfloor_ros.core.camera.images import (
     CorruptImageError,
     EightBitScale,
     colour_image,
-    decode_file,
     grey_image,
     to_grey,
 )
 from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.files.images import decode_file
 
 RED, GREEN, BLUE = 200, 100, 50
 GREY = round(0.299 * RED + 0.587 * GREEN + 0.114 * BLUE)
