@@ -9,14 +9,14 @@ from setuptools import find_packages, setup
 PACKAGE = 'segfloor_ros'
 PROGRAMS = {
     'segfloor': 'apps.cli:start',
-    'stereo_camera': 'apps.stereo_camera:main',
-    'stereo_slam': 'nodes.stereo_slam:main',
-    'floor_segmentation': 'nodes.floor_segmentation:main',
-    'cloud_labelling': 'nodes.cloud_labelling:main',
-    'occupancy_grid': 'nodes.occupancy_grid:main',
-    'segfloor_pipeline': 'apps.segfloor_pipeline:main',
-    'simulated_robot': 'apps.simulation.simulated_robot:main',
-    'segfloor_masks': 'nodes.segfloor_masks:main',
+    'stereo_camera': 'apps.programs:stereo_camera',
+    'stereo_slam': 'apps.programs:stereo_slam',
+    'floor_segmentation': 'apps.programs:floor_segmentation',
+    'cloud_labelling': 'apps.programs:cloud_labelling',
+    'occupancy_grid': 'apps.programs:occupancy_grid',
+    'segfloor_pipeline': 'apps.programs:segfloor_pipeline',
+    'simulated_robot': 'apps.programs:simulated_robot',
+    'segfloor_masks': 'apps.programs:segfloor_masks',
 }
 HERE = Path(__file__).resolve().parent
 VERSION = re.search(r"__version__ = '(.+)'", (HERE / PACKAGE / '__init__.py').read_text())[1]
@@ -77,6 +77,7 @@ setup(
             'typer>=0.12',
             'rich>=13',
             'rosbags>=0.10',
+            'mcap>=1.1',
             'evo>=1.28',
             'matplotlib>=3.6',
             'junitparser>=3',

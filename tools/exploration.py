@@ -18,7 +18,6 @@ from typing import Annotated, Any
 import typer
 
 from segfloor_ros.apps.cli.printing import console
-from segfloor_ros.core.files.results import write_file
 from segfloor_ros.core.files.whole import read_json
 
 CAMERA = ('kind=realsense', 'width=480', 'height=360', 'rate_hz=3')
@@ -87,7 +86,7 @@ def main(
                     command = JOBS[name].command(seed, goals, maps, out)
                     status = subprocess.run(command, stdout=log, stderr=log, check=False).returncode
                 console.print(f'{name} {seed}: {"done" if not status else f"ended with {status}"}')
-            write_file(work / 'table.md', table(work, seeds).encode())
+            (work / 'table.md').write_bytes(table(work, seeds).encode())
     console.print((work / 'table.md').read_text(), highlight=False, soft_wrap=True)
 
 

@@ -30,7 +30,6 @@ from segfloor_ros.apps.simulation.simulation import RecordingOptions, render_onc
 from segfloor_ros.apps.suite.job import run_segfloor
 from segfloor_ros.apps.suite.measures import measure_run, start_pose_of
 from segfloor_ros.apps.trajectory import read_trajectory
-from segfloor_ros.core.files.results import write_file
 from segfloor_ros.core.files.whole import read_json
 from segfloor_ros.core.geometry import Array
 
@@ -114,14 +113,14 @@ def measure(
         'drives': drives,
         'demo': _demo(work),
     }
-    write_file(FIGURES, (json.dumps(found, indent=1) + '\n').encode())
+    FIGURES.write_bytes((json.dumps(found, indent=1) + '\n').encode())
 
 
 @app.command()
 def write() -> None:
     """Put the figures of docs/figures.json between the marks of README and docs/benchmarks.md."""
     for page in PAGES:
-        write_file(page, written(page.read_text(encoding='utf-8')).encode())
+        page.write_bytes(written(page.read_text(encoding='utf-8')).encode())
 
 
 def written(page: str) -> str:

@@ -28,7 +28,6 @@ from segfloor_ros.apps.simulation.scene_file import open_scene
 from segfloor_ros.apps.simulation.simulation import RecordingOptions, render_once
 from segfloor_ros.apps.suite.job import ProgramError, run_segfloor
 from segfloor_ros.core.contracts import POINT_FLOOR, POINT_OBSTACLE
-from segfloor_ros.core.files.results import write_file
 
 SMALL = ('camera.width=480', 'camera.height=360')
 WIDTH_PX = 640
@@ -123,7 +122,7 @@ def _drawn(symptom: Symptom, name: str, out: Path) -> str:
     picture = _side_view(result) if symptom.from_the_side else _on_the_truth(result, recording)
     scale = WIDTH_PX / picture.shape[1]
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    write_file(out / f'{name}.png', cv2.imencode('.png', small)[1].tobytes())
+    (out / f'{name}.png').write_bytes(cv2.imencode('.png', small)[1].tobytes())
     return log.read_text()
 
 

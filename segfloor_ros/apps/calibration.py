@@ -22,9 +22,10 @@ from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibrati
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.camera.pixels import Grey
 from segfloor_ros.core.contracts import InputFault, StereoFrame
-from segfloor_ros.core.errors import CalibrationError, CorruptImageError, InputError, os_errors
+from segfloor_ros.core.errors import CalibrationError, CorruptImageError, InputError
 from segfloor_ros.core.files.images import read_grey
-from segfloor_ros.core.files.results import add_files, check_target
+from segfloor_ros.core.files.writing import PAGE as HTML
+from segfloor_ros.core.files.writing import YAML, check_output, write_output
 from segfloor_ros.core.geometry import Array, make_transform
 from segfloor_ros.core.plugins.rig.check import EVERY, RigCheck
 from segfloor_ros.core.plugins.rig.estimates import ROWS_PX
@@ -42,6 +43,7 @@ MAX_SCALE_ERROR = 0.01
 SOLVER_END = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9)
 
 FILES, PAGE = ('left.yaml', 'right.yaml'), 'calibration.html'
+KINDS = dict.fromkeys(FILES, YAML) | {PAGE: HTML}
 
 DICTIONARY = '5X5_1000'
 """Of the markers of a ChArUco board; it has those of 5X5_50, 5X5_100 and 5X5_250 as its first."""
@@ -239,7 +241,8 @@ def calibrate_folder(
     """
     left, right = find_image_pairs(folder)
     target = folder if out is None else out
-    check_target(target, (*FILES, PAGE))
+    for name, kind in KINDS.items():
+        check_output(target / name, kind)
     views, size, left_out = _find_boards(list(zip(left, right, strict=True)), board, on_progress)
     if len(views) < MIN_PAIRS:
         raise CalibrationError(
@@ -248,8 +251,8 @@ def calibrate_folder(
         )
     calibration, rms_px, errors_px = _solve(views, size, board, str(folder))
     texts = ros_calibration(calibration.left, 'left'), ros_calibration(calibration.right, 'right')
-    with os_errors(f'{target}: cannot be written', '; choose another --out'):
-        add_files(target, {n: text.encode() for n, text in zip(FILES, texts, strict=True)})
+    for name, text in zip(FILES, texts, strict=True):
+        write_output(target / name, YAML, text.encode())
     rows_px = [_rows_rms_px(calibration, view) for view in views]
     errors_px = np.column_stack([errors_px, rows_px])
     order = np.argsort(-np.linalg.norm(errors_px[:, :2], axis=1), kind='stable')

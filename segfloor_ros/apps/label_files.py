@@ -32,7 +32,7 @@ def labels_of(numbers: OccupancyGrid, classes: list[str]) -> Labels:
 
 def save_labels(path: Path, grid: OccupancyGrid, labels: Labels) -> None:
     """Write the labels of cells as a map for map_server, mode raw, with the names of the classes
-    in its YAML. Raises MapError.
+    in its YAML. Raises InputError.
     """
     assert labels.cells is not None
     save_map(numbered(grid, labels.cells), path, 'raw', {'classes': labels.classes})

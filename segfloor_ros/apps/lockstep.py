@@ -35,12 +35,8 @@ from segfloor_ros.core.contracts import (
 )
 from segfloor_ros.core.errors import MapError, SegfloorError, SettingsError
 from segfloor_ros.core.files.arrays import MapFile
-from segfloor_ros.core.files.results import (
-    check_writable,
-    is_map_file,
-    read_map_file,
-    write_map_file,
-)
+from segfloor_ros.core.files.results import SAVED_MAP, read_map_file, write_map_file
+from segfloor_ros.core.files.writing import check_output
 from segfloor_ros.core.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
@@ -53,7 +49,6 @@ from segfloor_ros.core.plugins.semantics.label_map import Labels
 from segfloor_ros.core.plugins.semantics.network import ImageLabeller, Network
 from segfloor_ros.core.plugins.semantics.semantic_map import SemanticMap
 from segfloor_ros.core.slam.held_results import left_out
-from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE
 from segfloor_ros.core.slam.thresholds import MAJORITY
 from segfloor_ros.core.timing import StageTimes
@@ -88,11 +83,14 @@ class SaveMasks(str, Enum):
 
 @dataclasses.dataclass(frozen=True)
 class MapOptions:
-    """Maps on disk: to go on with, and to save. localize: the loaded map stays as it is."""
+    """Maps on disk: to go on with, and to save. localize: the loaded map stays as it is. inputs: of
+    the command, none of which is written to.
+    """
 
     load: Path | None = None
     save: Path | None = None
     localize: bool = False
+    inputs: tuple[Path | str | None, ...] = ()
 
     def __post_init__(self) -> None:
         if self.localize and self.load is None:
@@ -100,7 +98,7 @@ class MapOptions:
         if self.localize and self.save is not None:
             raise SettingsError('--localize adds nothing to the map: leave --save-map out')
         if self.save is not None:
-            check_writable(self.save, '--save-map', is_map_file)
+            check_output(self.save, SAVED_MAP, (self.load, *self.inputs), '--save-map')
 
     def read(self, camera: StereoCamera) -> MapFile | None:
         """Return the map to go on with, None where there is none. Raises InputError, also for a map
@@ -112,13 +110,10 @@ class MapOptions:
         check_camera(saved, camera, str(self.load))
         return saved
 
-    def write(
-        self, write: Callable[[Path], object], interrupted: bool, or_elsewhere: bool = True
-    ) -> str:
+    def write(self, write: Callable[[Path], object], interrupted: bool) -> str:
         """Have the map saved; returns where it is, in words, where that is elsewhere: what is
-        interrupted does not replace an older map. Where it cannot be written, the words are why;
-        with `or_elsewhere` MapError is raised and the map is in the folder for temporary files, if
-        it can be written there.
+        interrupted does not replace an older map. Raises MapError where it cannot be written; it is
+        in the folder for temporary files then, if it can be written there.
         """
         assert self.save is not None
         path = self.save
@@ -127,8 +122,6 @@ class MapOptions:
         try:
             write(path)
         except SegfloorError as error:
-            if not or_elsewhere:
-                return str(error)
             elsewhere = Path(tempfile.mkdtemp(prefix='segfloor-map-'))
             try:
                 write(elsewhere / path.name)
@@ -265,24 +258,15 @@ class LockstepRun:
         return self._interrupted.is_set() or self.broken_off is not None
 
     def save_map(self) -> None:
-        """Save the map, after `execute`; one that the drive has not recognised is not overwritten
-        with its own. Raises MapError where it cannot be written there.
-        """
-        save, load = self._map_options.save, self._map_options.load
+        """Save the map, after `execute`. Raises MapError where it cannot be written there."""
+        save = self._map_options.save
         if save is None:
             return
         if self.no_map:
             self.note = f'{save}: is not written, since there is no map'
             return
-        is_outside = self._pipeline.slam.back_end.submap is Submap.OUTSIDE
-        if is_outside and load is not None and save.resolve() == load.resolve():
-            self.note = (
-                f'{save}: stays as it was, since no place of it was recognised; give --save-map '
-                'another name to keep the map of this drive'
-            )
-            return
-        saved = save_pipeline(self._pipeline)
-        write = partial(write_map_file, saved=saved)
+        inputs = (self._map_options.load, *self._map_options.inputs)
+        write = partial(write_map_file, saved=save_pipeline(self._pipeline), inputs=inputs)
         self.note = self._map_options.write(write, self._is_cut_short)
 
     def _tracked_poses(self) -> list[TrackedPose]:

@@ -1,6 +1,6 @@
 """The results folder of a run: maps, trajectories, cloud, masks, summary and settings.
 
-Everything is written to a hidden folder beside the target and moved into place at the end, so that
+Everything is written to a temporary folder in the target and moved into place at the end, so that
 a run that fails leaves nothing half-written; a result that cannot be written there goes elsewhere.
 """
 
@@ -27,13 +27,13 @@ from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.contracts import FrameResult, LabelledPoints, Mount
 from segfloor_ros.core.errors import InputError, SegfloorError
 from segfloor_ros.core.files.images import png_bytes
-from segfloor_ros.core.files.results import (
+from segfloor_ros.core.files.whole import read_json
+from segfloor_ros.core.files.writing import (
     check_target,
     folder_in_the_making,
     move_into_place,
     own_files,
 )
-from segfloor_ros.core.files.whole import read_json
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.plugins.semantics.label_map import Labels
 from segfloor_ros.core.plugins.semantics.outputs import UNLABELLED
@@ -55,6 +55,7 @@ OUTPUT_NAMES = (
     'labelled_cloud.ply',
     'summary.json',
     'settings.yaml',
+    'overlay.png',
     REPORT,
 )
 
@@ -240,7 +241,7 @@ class OutputFolder:
     path: where the results are. problems: what could not be written, in words.
     """
 
-    def __init__(self, target: Path, inputs: Iterable[Path | str] = ()) -> None:
+    def __init__(self, target: Path, inputs: Iterable[Path | str | None] = ()) -> None:
         check_target(target, OUTPUT_NAMES, inputs)
         self.path = target
         self.problems: list[str] = []
@@ -290,7 +291,7 @@ class OutputFolder:
         tried: list[tuple[int, Path, dict[str, str]]] = []
         for parent in (Path(tempfile.gettempdir()), Path.cwd()):
             try:
-                folder = Path(tempfile.mkdtemp(prefix=f'{self.path.name}-', dir=parent))
+                folder = Path(tempfile.mkdtemp(prefix='segfloor-result-', dir=parent))
             except OSError:
                 continue
             failed = _write_files(folder, result)

@@ -15,11 +15,10 @@ from multiprocessing.context import SpawnProcess
 from types import FrameType
 from typing import Any
 
+from segfloor_ros.core.starting import SIGNALS, is_ignored_hangup
+
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
-
-
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def end_with_parent(parent_id: int) -> None:
@@ -63,20 +62,22 @@ class Interrupt(threading.Event):
 
 @contextlib.contextmanager
 def terminated_like_interrupted() -> Iterator[None]:
-    """Let SIGTERM within the block end what is under way with all its clean-ups, status 143."""
+    """Let SIGTERM and SIGHUP within the block end what is under way with all its clean-ups, status
+    143 and 129.
+    """
 
     def end(number: int, frame: FrameType | None) -> None:
         sys.exit(128 + number)
 
-    with _handled_by(end, (signal.SIGTERM,)):
+    with _handled_by(end, (signal.SIGTERM, signal.SIGHUP)):
         yield
 
 
 @contextlib.contextmanager
 def interrupts_deferred() -> Iterator[None]:
-    """Deliver SIGINT and SIGTERM at the end of the block, so that none falls between the start of a
-    process and the note that it runs, or into a fork, where exceptions are ignored. A started
-    program gets the default handlers again. Beside the main thread, which alone gets signals,
+    """Deliver `SIGNALS` at the end of the block, so that none falls between the start of a process
+    and the note that it runs, or into a fork, where exceptions are ignored. A started program gets
+    the default handlers again. Beside the main thread, which alone gets signals,
     nothing is done.
     """
     if threading.current_thread() is not threading.main_thread():
@@ -95,7 +96,7 @@ def interrupts_deferred() -> Iterator[None]:
 
 @contextlib.contextmanager
 def first_interrupt_noted() -> Iterator[Interrupt]:
-    """Set an event at the first SIGINT or SIGTERM within the block, so that the work can come to an
+    """Set an event at the first of `SIGNALS` within the block, so that the work can come to an
     orderly end; the next one takes its usual course.
     """
     event = Interrupt()
@@ -114,7 +115,8 @@ def _handled_by(
     handle: Callable[[int, FrameType | None], None], signals: Sequence[signal.Signals] = SIGNALS
 ) -> Iterator[Callable[[], None]]:
     """Handle signals within the block otherwise; yields what restores the handlers before."""
-    before = {number: signal.signal(number, handle) for number in signals}
+    taken = [number for number in signals if not is_ignored_hangup(number)]
+    before = {number: signal.signal(number, handle) for number in taken}
 
     def restore() -> None:
         for number, handler in before.items():

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,16 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from segfloor_ros.core.errors import MapError
-from segfloor_ros.core.files.results import replacing
+from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.files.writing import (
+    HASH_BYTES,
+    MARK,
+    YAML,
+    Kind,
+    check_output,
+    hash_of,
+    write_output,
+)
 from segfloor_ros.core.grid.occupancy import FREE_THRESH, OCCUPIED_THRESH, OccupancyGrid
 
 
@@ -21,8 +30,9 @@ def save_map(
     """Write `path` (YAML) and the PGM of the same name beside it; both appear whole or not at all.
 
     Free, occupied and unknown are kept; with mode `raw`, the numbers of the cells. facts: further
-    entries of the YAML. Raises MapError when the folder cannot be written.
+    entries of the YAML. Raises InputError where they cannot be written.
     """
+    check_map_output(path)
     image_path = path.with_suffix('.pgm')
     description = {
         'image': image_path.name,
@@ -35,18 +45,32 @@ def save_map(
         **(facts or {}),
     }
     pixels = grid.cells[::-1].view(np.uint8) if mode == 'raw' else grid.picture
-    _replace_file(image_path, _pgm_bytes(pixels))
-    _replace_file(path, yaml.safe_dump(description, sort_keys=False).encode())
+    image = _pgm_bytes(pixels)
+    digest = hashlib.blake2b(image, digest_size=HASH_BYTES).hexdigest()
+    text = f'# {MARK}, with an image {digest}\n{yaml.safe_dump(description, sort_keys=False)}'
+    write_output(image_path, _image_of(path), image)
+    write_output(path, YAML, text.encode())
+
+
+def check_map_output(path: Path, inputs: Iterable[Path | str | None] = ()) -> None:
+    """Raise InputError unless a map can be written to `path` (YAML) and the PGM beside it."""
+    inputs = [*inputs]
+    if path.suffix == '.pgm':
+        raise InputError(f'{path}: is a name for the image; name the YAML file')
+    check_output(path, YAML, inputs)
+    check_output(path.with_suffix('.pgm'), _image_of(path), inputs)
+
+
+def _image_of(path: Path) -> Kind:
+    """Return the kind of the image that belongs to a map of segfloor and is unchanged since."""
+
+    def is_own(image: Path) -> bool:
+        has_map = path.is_file() and YAML.is_own(path)
+        return has_map and hash_of(image) in path.read_text(errors='replace').partition('\n')[0]
+
+    return Kind('image of a map', is_own)
 
 
 def _pgm_bytes(pixels: NDArray[np.uint8]) -> bytes:
     rows, columns = pixels.shape
     return f'P5\n{columns} {rows}\n255\n'.encode() + pixels.tobytes()
-
-
-def _replace_file(path: Path, content: bytes) -> None:
-    try:
-        with replacing(path) as file:
-            file.write(content)
-    except OSError as error:
-        raise MapError(f'{path}: cannot write the map ({error.strerror})') from error

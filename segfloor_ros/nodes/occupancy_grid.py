@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from pathlib import Path as FilePath
 from typing import Any
 
 from rclpy.timer import Timer
 
 from segfloor_ros.core.errors import MapError, SettingsError
 from segfloor_ros.core.files.arrays import MapFile
+from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.grid.mapper import OccupancyGridMapper
 from segfloor_ros.nodes.messages.grids import grid_message
 from segfloor_ros.nodes.messages.points import features_arrays, labelled_arrays
@@ -96,7 +96,7 @@ class OccupancyGridNode(StageNode[OccupancyGridNodeSettings]):
             raise SettingsError('map_file is empty; set it to the name of a file, e.g. map.yaml')
         if not self._part.frame_id:
             raise MapError('there is no map yet: no keyframe has arrived')
-        path = FilePath(name).expanduser().absolute()
+        path = user_path(name).absolute()
         if path.suffix not in YAML_SUFFIXES:
             path = path.with_name(f'{path.name}.yaml')
         from segfloor_ros.nodes.map_files import save_map

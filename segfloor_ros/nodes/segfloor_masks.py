@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from std_msgs.msg import String
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import KeyframePath, Mount
+from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.plugins.semantics.label_map import LabelMap, numbered
 from segfloor_ros.core.plugins.semantics.network import ImageLabeller, NetworkSettings
 from segfloor_ros.nodes.messages.colours import colour8_image
@@ -124,7 +124,7 @@ class SegfloorMasksNode(StageNode[SegfloorMasksNodeSettings]):
 
     def set_up(self) -> None:
         """Read the network and make the topics."""
-        network = open_network(Path(self.settings.network).expanduser())
+        network = open_network(user_path(self.settings.network))
         self._labeller = ImageLabeller(network)
         self._every = network.settings.every
         self._work = self.inputs.later(self._process)

@@ -334,6 +334,7 @@ class CameraWatch:
                 Level.ERROR,
             )
         self._find_silence()
+        self._find_unstamped()
         self._find_mono()
         self._find_different_stamps()
 
@@ -365,6 +366,16 @@ class CameraWatch:
                     f'silence of {topic}',
                     f'no image on {topic} for a while; is the camera connected and its driver '
                     'running?',
+                    Level.ERROR,
+                )
+
+    def _find_unstamped(self) -> None:
+        for topic, stamps in self._stamps.items():
+            if len(stamps) == RECENT and not any(stamps):
+                self._node.reporter.diagnose(
+                    f'stamps of {topic}',
+                    f'all stamps on {topic} are zero: no pair can be tracked; let the driver '
+                    'stamp its images',
                     Level.ERROR,
                 )
 

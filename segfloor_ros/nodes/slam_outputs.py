@@ -24,6 +24,7 @@ from segfloor_ros.core.camera.pixels import Region, shrink_factor, shrunk_camera
 from segfloor_ros.core.contracts import FrameResult, Keyframe, LoadedMap, Mount, StereoFrame
 from segfloor_ros.core.errors import MapError, SettingsError
 from segfloor_ros.core.files.arrays import MapFile
+from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
@@ -386,7 +387,7 @@ class SlamMaps:
             return None
         from segfloor_ros.core.files.results import read_map_file
 
-        return read_map_file(Path(name).expanduser())
+        return read_map_file(user_path(name))
 
     def keep(self, slam: StereoSlam) -> None:
         """Keep what a later life of this node goes on from, where there are new keyframes."""
@@ -428,6 +429,7 @@ class SlamMaps:
     def _load(self) -> str:
         if not self._own.load_map:
             raise SettingsError('load_map is empty; set it to the name of a saved map')
+        self.read()  # one that cannot be read leaves the map as it is
         self._node.reset('by ~/load_map')
         return self._own.load_map
 
@@ -446,7 +448,7 @@ class SlamMaps:
             raise SettingsError('save_map is empty; set it to the name of a file, e.g. home.map')
         if self._arrived is not None:
             raise MapError('a map is being saved already')
-        return Path(self._own.save_map).expanduser().absolute()
+        return user_path(self._own.save_map).absolute()
 
     async def _prune(self) -> str:
         """Prune the file of `save_map` beside tracking; the map in use stays as it is."""
@@ -459,37 +461,61 @@ class SlamMaps:
 
     async def _save(self) -> str:
         """Gather the map and write it beside tracking, which goes on meanwhile."""
+        return await self._completed(*self._begin_to_save())
+
+    def save_before_reset(self) -> None:
+        """Begin to save a map that is dropped now, where `save_map` names a file."""
+        slam = self._slam()
+        has_map = slam is not None and slam.mount is not None and bool(slam.map.keyframes)
+        if not (self._own.save_map and has_map) or self._own.localize or self._arrived is not None:
+            return
+        node, log_fault = self._node, self._node.reporter.log_fault
+
+        async def complete(path: Path, saved: MapFile) -> None:
+            try:
+                place = await self._completed(path, saved)
+                node.get_logger().warning(f'the map before the reset is in {place}')
+            except Exception as error:
+                log_fault('save_map, before the reset', error)
+
+        try:
+            assert node.executor is not None
+            node.executor.create_task(complete, *self._begin_to_save())
+        except Exception as error:
+            log_fault('save_map, before the reset', error)
+
+    def _begin_to_save(self) -> tuple[Path, MapFile]:
+        """Ask for the parts of the other nodes; returns where to save, and SLAM's own part."""
+        from segfloor_ros.core.files.results import SAVED_MAP
+        from segfloor_ros.core.files.writing import check_output
+
         path = self._file_to_save()
-        self._refuse_to_overwrite(path)
+        check_output(path, SAVED_MAP, (self._own.load_map,), 'save_map')
         saved = self._slam_part()
-        start_ns = saved.header.pop('start_ns')
         self._arrived = Future()
-        give_up = self._node.inputs.steady_timer(PATIENCE_S, self._give_up)
         last_ns = int(saved.parts['slam']['keyframe_stamp_ns'][-1])
         self._node.outputs.publish(MAP_WANTED, make_header(last_ns, self._own.map_frame))
+        return path, saved
+
+    async def _completed(self, path: Path, saved: MapFile) -> str:
+        """Save a map once the parts of the other nodes have come; returns where it is."""
+        start_ns, arrived = saved.header.pop('start_ns'), self._arrived
+        assert arrived is not None
+        give_up = self._node.inputs.steady_timer(PATIENCE_S, self._give_up)
         try:
-            await self._arrived
+            await arrived
             for part in self._parts.values():
                 if part.header['start_ns'] != start_ns:
                     raise MapError('the map was reset while it was saved')
                 saved.parts |= part.parts
             from segfloor_ros.core.files.results import write_map_file
 
-            await _in_background(partial(write_map_file, path, saved))
+            inputs = (self._own.load_map,)
+            await _in_background(partial(write_map_file, path, saved, inputs))
         finally:
             self._node.destroy_timer(give_up)
             self._arrived, self._parts = None, {}
         return str(path)
-
-    def _refuse_to_overwrite(self, path: Path) -> None:
-        """Raise MapError where a map would be replaced that the drive has not recognised."""
-        slam, load_map = self._slam(), self._own.load_map
-        is_outside = slam is not None and slam.back_end.submap is Submap.OUTSIDE
-        if is_outside and load_map and Path(load_map).expanduser().resolve() == path.resolve():
-            raise MapError(
-                f'{path}: stays as it was, since no place of it was recognised; set save_map to '
-                'another name to keep the map of this drive'
-            )
 
     def _give_up(self) -> None:
         if self._arrived is not None and not self._arrived.done():

@@ -260,6 +260,10 @@ class InitialPose:
             self._node.reporter.diagnose(INITIAL_POSE, text, lasts_s=PATIENCE_S)
             return
         T_map_base = pose_array(message.pose.pose)
+        if not np.isfinite(message.pose.covariance).all():
+            text = f'{INITIAL_POSE}: its covariance is not finite; give numbers, or zeros'
+            self._node.reporter.diagnose(INITIAL_POSE, text, lasts_s=PATIENCE_S)
+            return
         sigma = np.sqrt(np.maximum(np.diag(np.reshape(message.pose.covariance, (6, 6))), 0.0))
         sigmas = float(np.sqrt(chi2_limit(1, GATE)))
         reach_m = sigmas * max(float(sigma[:3].max()), LEAST_SIGMA_M)

@@ -8,7 +8,6 @@ from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import Mount, StereoFrame
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.arrays import MapFile
-from segfloor_ros.core.geometry import MAX_DISORDER_NS
 from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE, StereoSlam
 from segfloor_ros.nodes.messages.diagnostics import Level
 from segfloor_ros.nodes.messages.topics import FRAME_DONE, make_header
@@ -16,6 +15,7 @@ from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import CHECK_S
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
+from segfloor_ros.nodes.shared.stamp_order import InTime, StampOrder
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.nodes.slam_camera import Pair, StereoInput
 from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamMaps, SlamResults
@@ -55,7 +55,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         self._sensors.reset()
         self.masks.reset()
         self._initial_pose.reset()
-        self._last_stamp_ns: int | None = None
+        self._stamps = StampOrder()
         self._is_started = self._is_resumed = False
         self._frame_count = 0
         if saved is not None:
@@ -65,6 +65,11 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             camera = saved_camera(saved, name)
             self.slam = self._make_slam(camera)
             self._maps.loaded = saved, load_slam(self.slam, camera, saved, name, own.localize)
+
+    def reset(self, reason: str) -> None:
+        """Drop the map, which is saved first where `save_map` names a file."""
+        self._maps.save_before_reset()
+        super().reset(reason)
 
     def restore(self, saved: MapFile) -> None:
         """Go on with the map of a killed node: with its stamps, and where it ended. Raises
@@ -78,7 +83,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         camera = saved_camera(saved, 'kept map')
         self.slam = self._make_slam(camera)
         load_slam(self.slam, camera, saved, 'kept map', last=last)
-        self._last_stamp_ns = last.stamp_ns
+        self._stamps = StampOrder(last.stamp_ns)
         self._is_resumed = True
 
     def is_needed_otherwise(self) -> bool:
@@ -102,7 +107,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
 
     def _take_late_mask(self, stamp_ns: int) -> None:
         """Take points back, where the mask is of a frame that was tracked already."""
-        last_ns = self._last_stamp_ns
+        last_ns = self._stamps.last_ns
         if self.slam is not None and last_ns is not None and stamp_ns <= last_ns:
             mask = self.masks.mask_of(stamp_ns, self._camera.rectifier)
             self.slam.late_masks.add(stamp_ns, mask)
@@ -155,14 +160,20 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         """Whether a pair comes after the one before; where time has jumped back, e.g. because a
         recording is played again, the map is reset.
         """
-        last_ns = self._last_stamp_ns
-        if last_ns is not None and stamp_ns < last_ns - MAX_DISORDER_NS:
-            jump_s = 1e-9 * (last_ns - stamp_ns)
-            self.reset(f'the stamps of the images went back by {jump_s:.3f} s')
-        elif last_ns is not None and stamp_ns <= last_ns:
-            self.reporter.report(stamp_ns, Level.ERROR, 'older than the pair before it; dropped')
+        stamps, last_ns = self._stamps, self._stamps.last_ns
+        found = stamps.take(stamp_ns)
+        step_s = 0.0 if last_ns is None else 1e-9 * (stamp_ns - last_ns)
+        if found in (InTime.LATE, InTime.ELSEWHERE):
+            words = {
+                InTime.LATE: 'older than the pair before it; dropped',
+                InTime.ELSEWHERE: f'its stamp is {step_s:.3f} s from the one before; dropped',
+            }
+            self.reporter.health.count('dropped')
+            self.reporter.report(stamp_ns, Level.ERROR, words[found])
             return False
-        self._last_stamp_ns = stamp_ns
+        if found is InTime.JUMPED and step_s < 0:
+            self.reset(f'the stamps of the images went back by {-step_s:.3f} s')
+            self._stamps = stamps
         return True
 
     def _process(self, stamp_ns: int, pair: Pair) -> None:

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from segfloor_ros.apps.map_files import load_map
-from segfloor_ros.core.errors import InputError, MapError
+from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from segfloor_ros.nodes.map_files import save_map
 
@@ -125,9 +125,21 @@ def test_a_missing_file_and_a_broken_image_are_refused(tmp_path: Path) -> None:
 
 
 def test_saving_where_one_cannot_write_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(MapError, match='cannot write the map'):
-        save_map(GRID, tmp_path / 'missing' / 'map.yaml')
-    assert list(tmp_path.iterdir()) == []
+    (tmp_path / 'file').write_text('mine')
+    with pytest.raises(InputError, match='cannot be written'):
+        save_map(GRID, tmp_path / 'file' / 'map.yaml')
+    assert list(tmp_path.iterdir()) == [tmp_path / 'file']
+
+
+def test_an_image_that_was_changed_by_hand_is_not_replaced(tmp_path: Path) -> None:
+    save_map(GRID, tmp_path / 'map.yaml')
+    save_map(GRID, tmp_path / 'map.yaml')
+    image = tmp_path / 'map.pgm'
+    image.write_bytes(image.read_bytes()[:-1] + b'\x00')
+    before = image.read_bytes()
+    with pytest.raises(InputError, match='is no image of a map that segfloor wrote'):
+        save_map(GRID, tmp_path / 'map.yaml')
+    assert image.read_bytes() == before
 
 
 def test_a_grid_knows_where_its_cells_lie_whatever_its_origin_and_shape() -> None:

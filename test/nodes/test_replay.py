@@ -182,16 +182,17 @@ def test_an_interrupted_map_does_not_replace_the_one_that_was_loaded(drive, tmp_
     status, _, errors = segfloor('run', start_of_it, '--out', tmp_path / 'run', '--save-map', home)
     assert status == 0, errors
     before = home.read_bytes()
-    maps = ('--load-map', home, '--save-map', home)
+    grown = shutil.copy(home, tmp_path / 'grown.map')
+    maps = ('--load-map', home, '--save-map', grown)
     replay = start('replay', drive, '--out', out, '--rate', 0.2, *maps)
-    while not list(tmp_path.rglob('made/floor_masks/*.png')) and replay.poll() is None:
+    while not list(tmp_path.rglob('.segfloor-*/floor_masks/*.png')) and replay.poll() is None:
         time.sleep(0.05)
     replay.send_signal(signal.SIGINT)
     _, errors = replay.communicate(timeout=60)
     assert replay.returncode == 128 + signal.SIGINT, errors
-    assert home.read_bytes() == before
-    assert f'{home}: stays as it was; the map is in {home}.interrupted' in errors
-    assert read_map_file(tmp_path / 'home.map.interrupted').parts.keys() >= {'slam', 'grid'}
+    assert home.read_bytes() == before == grown.read_bytes()
+    assert f'{grown}: stays as it was; the map is in {grown}.interrupted' in errors
+    assert read_map_file(tmp_path / 'grown.map.interrupted').parts.keys() >= {'slam', 'grid'}
 
 
 def test_a_node_that_dies_ends_the_replay_by_its_name(drive, tmp_path) -> None:
@@ -251,7 +252,7 @@ def test_a_killed_replay_leaves_no_node_and_no_file(drive, tmp_path, monkeypatch
     (temporary := tmp_path / 'temporary').mkdir()
     monkeypatch.setenv('TMPDIR', str(temporary))
     replay = start('replay', drive, '--out', tmp_path / 'out', '--rate', 0.2)
-    while not list(tmp_path.rglob('made/floor_masks/*.png')) and replay.poll() is None:
+    while not list(tmp_path.rglob('.segfloor-*/floor_masks/*.png')) and replay.poll() is None:
         time.sleep(0.05)
     nodes = node_processes(replay)
     assert len(nodes) == 5
@@ -271,7 +272,7 @@ def test_a_killed_replay_leaves_no_node_and_no_file(drive, tmp_path, monkeypatch
 def test_a_node_that_dies_midway_keeps_what_is_mapped(drive, tmp_path) -> None:
     out = tmp_path / 'out'
     replay = start('replay', drive, '--out', out, '--rate', 0.2)
-    while len(list(tmp_path.rglob('made/floor_masks/*.png'))) < 2 and replay.poll() is None:
+    while len(list(tmp_path.rglob('.segfloor-*/floor_masks/*.png'))) < 2 and replay.poll() is None:
         time.sleep(0.05)
     time.sleep(1.0)  # the map of them arrives
     os.kill(node_processes(replay)['floor_segmentation'], signal.SIGKILL)

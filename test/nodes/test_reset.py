@@ -26,6 +26,7 @@ from segfloor_ros.nodes.messages.points import labelled_arrays
 from segfloor_ros.nodes.messages.poses import transform_array
 from segfloor_ros.nodes.messages.topics import MAP_START, TOPICS, to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
+from segfloor_ros.nodes.shared.stamp_order import AGREEING
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 S = 1_000_000_000
@@ -107,10 +108,13 @@ def assert_same(found, expected) -> None:
 
 
 def test_a_recording_that_begins_again_gives_the_map_of_a_fresh_run(make_graph) -> None:
+    """Of all but the pairs that show that time has jumped back."""
     frames, _ = room_drive(FRAMES)
     chain = Chain(make_graph)
-    first = chain.drive(frames)
-    assert_same(chain.drive(frames), first)
+    chain.drive(frames)
+    again = chain.drive(frames)
+    chain.graph.close()
+    assert_same(again, Chain(make_graph).drive(frames[AGREEING - 1 :]))
 
 
 @pytest.mark.parametrize('how', ['service', 'killed'])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import tempfile
 from collections.abc import Generator
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,12 +20,12 @@ from segfloor_ros.apps.results_folder import OUTPUT_NAMES
 from segfloor_ros.apps.suite.description import Suite, read_suite
 from segfloor_ros.apps.suite.job import LOG, SAVED_MAP, Job, Outcome, outcomes, package_digest
 from segfloor_ros.apps.suite.measures import (
+    BASELINE,
     Baseline,
     Checked,
     SuiteResult,
     bounds_of_baseline,
     check,
-    is_baseline,
     known_measures,
     number,
     read_baseline,
@@ -34,8 +33,13 @@ from segfloor_ros.apps.suite.measures import (
 )
 from segfloor_ros.apps.suite.result_files import MEASURED, pack, unpack
 from segfloor_ros.core.errors import InputError, SettingsError, os_errors
-from segfloor_ros.core.files.results import add_files, check_target, check_writable
 from segfloor_ros.core.files.whole import read_json, read_text
+from segfloor_ros.core.files.writing import (
+    add_files,
+    check_output,
+    check_target,
+    folder_in_the_making,
+)
 from segfloor_ros.core.geometry import Pose2d
 
 COLUMNS = ('tracked_percent', 'path_error_m', 'precision_percent', 'recall_percent', 'time_ratio')
@@ -96,11 +100,12 @@ def check_suite(
     known = read_baseline(baseline) if baseline is not None else None
     _check_out(out, described)
     if baseline_to_write is not None:
-        check_writable(baseline_to_write, '--write-baseline', is_baseline)
+        check_output(baseline_to_write, BASELINE, [baseline, suite], '--write-baseline')
     folder = (cache or _default_cache()).absolute()
     todo = _jobs(described, folder, not no_cache)
     found: dict[str, Checked] = {}
     with (
+        folder_in_the_making(out),
         open_view(view) as shown,
         contextlib.closing(_all_outcomes(todo, out, resume, jobs, scheduler)) as results,
     ):
@@ -123,15 +128,11 @@ def check_suite(
 
 
 def _check_out(out: Path, suite: Suite) -> None:
-    """Raise InputError unless all results can be written to a folder, which is made."""
+    """Raise InputError unless all results can be written to a folder."""
     named = [(entry.input, entry.truth, entry.reference_map) for entry in suite.entries]
     check_target(out, (JUNIT, PAGE), [path for paths in named for path in paths])
     for entry in suite.entries:
         check_target(out / entry.name, FILES)
-    with os_errors(f'{out}: cannot be a folder for the results', '; choose another --out'):
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
 
 
 def _jobs(suite: Suite, cache: Path, reuse: bool) -> list[Job]:

@@ -24,9 +24,8 @@ from segfloor_ros.apps.evaluation.maps import load_truth
 from segfloor_ros.apps.lockstep import LockstepRun, SaveMasks
 from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.results_folder import OutputFolder
-from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.errors import MapError, SettingsError, about
-from segfloor_ros.core.files.results import add_files
+from segfloor_ros.core.files.writing import add_files
 from segfloor_ros.core.processes import Interrupt, first_interrupt_noted
 from segfloor_ros.nodes.network_files import open_network
 from segfloor_ros.nodes.settings.camera import StereoCameraNodeSettings
@@ -60,9 +59,9 @@ def run(
     maps = options.maps
     sees = None if options.network is None else open_network(options.network)
     configuration, source = options.open()
-    with open_view(options.view) as view:
+    with open_view(options.view, options.inputs) as view:
         with (
-            _drive(options, configuration) as (folder, interrupt),
+            _drive(options) as (folder, interrupt),
             terminal.progress_bar('mapping', source.frame_count) as progress,
         ):
             drive = LockstepRun(
@@ -96,17 +95,11 @@ def run(
 
 
 @contextmanager
-def _drive(
-    options: DriveOptions, configuration: Configuration
-) -> Iterator[tuple[OutputFolder, Interrupt]]:
+def _drive(options: DriveOptions) -> Iterator[tuple[OutputFolder, Interrupt]]:
     """The results folder of a drive, and the interrupt that ends it early: where there is no map
     yet, the command ends.
     """
-    camera = configuration.stereo_camera
-    with (
-        OutputFolder(options.out, (camera.input, camera.masks)) as folder,
-        first_interrupt_noted() as interrupt,
-    ):
+    with OutputFolder(options.out, options.inputs) as folder, first_interrupt_noted() as interrupt:
         try:
             yield folder, interrupt
         except MapError:
@@ -146,9 +139,9 @@ def replay(
         camera = dataclasses.replace(configuration.stereo_camera, depth=True)
         configuration = dataclasses.replace(configuration, stereo_camera=camera)
     loaded = maps.read(source.camera)
-    with open_view(options.view) as view:
+    with open_view(options.view, options.inputs) as view:
         with (
-            _drive(options, configuration) as (folder, interrupt),
+            _drive(options) as (folder, interrupt),
             terminal.progress_bar('replaying', source.frame_count) as progress,
         ):
             keep = partial(folder.add_picture, 'floor_masks')

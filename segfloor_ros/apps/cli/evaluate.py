@@ -58,8 +58,8 @@ from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.trajectory import FARTHEST, TUM_COLUMNS
 from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.errors import SettingsError
-from segfloor_ros.core.files.results import write_file
 from segfloor_ros.core.files.whole import number, read_table
+from segfloor_ros.core.files.writing import PNG, check_output, marked_png, write_output
 from segfloor_ros.core.geometry import Pose2d
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.nodes.configuration import resolve
@@ -109,6 +109,9 @@ def evaluate_map(
     segfloor evaluate map result corridor1 --overlay overlay.png
     segfloor evaluate map result truth.yaml --align found --json
     """
+    inputs = [estimate, truth, trajectory]
+    if overlay is not None:
+        check_output(overlay, PNG, inputs, '--overlay')
     grid = load_map(estimate / 'map.yaml' if estimate.is_dir() else estimate)
     known = load_truth(truth)
     pose = resolve_alignment(align, grid, known)
@@ -116,12 +119,13 @@ def evaluate_map(
     plan = RoadMapPlan(nodes=nodes, min_distance_m=min_distance, repetitions=repetitions, seed=seed)
     score = score_map(grid, known, pose, plan, sight)
     if overlay is not None:
-        write_file(overlay, overlay_png(compare(grid, known, pose, sight)))
+        picture = marked_png(overlay_png(compare(grid, known, pose, sight)))
+        write_output(overlay, PNG, picture, inputs)
     if as_json:
         return print_json(dataclasses.asdict(score))
     console.print(map_table(score))
     if overlay is not None:
-        typer.echo(f'overlay: {overlay}')
+        console.print(f'overlay: {overlay}', soft_wrap=True)
 
 
 @app.command('trajectory')
@@ -145,11 +149,14 @@ def evaluate_trajectory(
     """
     # Imported here: evo and matplotlib take a second that no other command should wait for.
     from segfloor_ros.apps.evaluation.trajectory import (
+        check_plot,
         match_files,
         save_trajectory_plot,
         score_trajectory,
     )
 
+    if plot is not None:
+        check_plot(plot, [estimate, truth])
     matched = match_files(estimate, truth, frames)
     score = score_trajectory(matched)
     if plot is not None:
@@ -166,7 +173,7 @@ def evaluate_trajectory(
     ]
     console.print(value_table('measure', rows))
     if plot is not None:
-        typer.echo(f'plot: {plot}')
+        console.print(f'plot: {plot}', soft_wrap=True)
 
 
 @app.command('floor')
@@ -212,7 +219,7 @@ def evaluate_report(
     """
     from segfloor_ros.apps.evaluation.report import write_report
 
-    typer.echo(f'report: {write_report(run, truth)}')
+    console.print(f'report: {write_report(run, truth)}', soft_wrap=True)
 
 
 def resolve_alignment(align: str, estimate: OccupancyGrid, truth: MapTruth) -> Pose2d:

@@ -44,8 +44,8 @@ from segfloor_ros.apps.trajectory import Trajectory, write_tum
 from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.contracts import UNKNOWN_COVARIANCE, FloorScan
 from segfloor_ros.core.errors import MapError, SettingsError, about, os_errors
-from segfloor_ros.core.files.results import check_target, folder_in_the_making, move_into_place
 from segfloor_ros.core.files.whole import read_json
+from segfloor_ros.core.files.writing import check_target, folder_in_the_making, move_into_place
 from segfloor_ros.core.geometry import Array, Pose2d, planar, transform_points
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.processes import Interrupt, first_interrupt_noted

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
+import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Annotated
 
@@ -150,16 +151,14 @@ def _options(
 def main() -> None:
     """Run the command line."""
     first = next((word for word in sys.argv[1:] if not word.startswith('-')), '')
-    with _known_errors():
-        app = program(tuple(COMMANDS) if COMPLETION in os.environ else (first,))
-    run_app(app)
+    run_app(lambda: program(tuple(COMMANDS) if COMPLETION in os.environ else (first,)))
 
 
 def run_command(command: Callable[..., None]) -> None:
     """Run a single command as a program of its own."""
     alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     alone.command()(command)
-    run_app(alone)
+    run_app(lambda: alone)
 
 
 def with_optional_values(words: list[str]) -> list[str]:
@@ -169,34 +168,51 @@ def with_optional_values(words: list[str]) -> list[str]:
     return ['--view=' if w == '--view' and not f.endswith(SUFFIX) else w for w, f in pairs]
 
 
-def run_app(app: typer.Typer) -> None:
-    """Run a command line; known errors print one line.
+def run_app(make_app: Callable[[], typer.Typer]) -> None:
+    """Make a command line and run it; known errors print one line.
 
-    Status 2: bad input; 1: no map came of it.
+    Status 2: bad input; 1: no map came of it, or what is printed could not be written.
     """
     logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
-    with _known_errors(), terminated_like_interrupted():
-        app(args=with_optional_values(sys.argv[1:]))
-
-
-@contextmanager
-def _known_errors() -> Iterator[None]:
+    status: str | int | None = 0
     try:
-        yield
+        app = make_app()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        with terminated_like_interrupted():
+            app(args=with_optional_values(sys.argv[1:]))
+    except SystemExit as ended:
+        status = ended.code
+    except KeyboardInterrupt:
+        status = 130
     except MapError as error:
         print_error(str(error))
-        sys.exit(1)
+        status = 1
     except SegfloorError as error:
         print_error(str(error))
-        sys.exit(2)
+        status = 2
     except ModuleNotFoundError as error:
         name = (error.name or '').partition('.')[0]
         if name == 'segfloor_ros' or not name:
             raise
         print_error(what_is_missing(name))
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
+        status = 2
+    except OSError as error:  # e.g. a name that is too long, or no space where is printed to
+        where = str(error.filename)[:200] if error.filename else 'standard output'
+        print_error(f'{where}: {error.strerror or error}')
+        status = 2 if error.filename else 1
+    sys.exit(_flushed(status))
+
+
+def _flushed(status: str | int | None) -> str | int | None:
+    """Return a status, or 1 where it is 0 and what was printed cannot be written."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if error.errno != errno.EPIPE:
+            print_error(f'standard output: cannot be written ({error.strerror})')
+        return status or 1
+    return status
 
 
 def what_is_missing(package: str) -> str:

@@ -23,7 +23,8 @@ from segfloor_ros.core.contracts import KeyframePath, SparseCloud
 from segfloor_ros.core.errors import InputError, MapError, SettingsError
 from segfloor_ros.core.files.arrays import Arrays, MapFile
 from segfloor_ros.core.files.images import png_bytes
-from segfloor_ros.core.files.results import read_map_file, write_file, write_map_file
+from segfloor_ros.core.files.results import SAVED_MAP, read_map_file, write_map_file
+from segfloor_ros.core.files.writing import PNG, check_output, marked_png, write_output
 from segfloor_ros.core.floor.pictures import MASK_COLOURS
 from segfloor_ros.core.geometry import planar
 from segfloor_ros.core.grid.keyframe_evidence import evidence_from_arrays, evidence_to_arrays
@@ -51,7 +52,7 @@ from segfloor_ros.core.plugins.maps.saved_slam import (
 from segfloor_ros.core.plugins.semantics.label_map import LABELS, LabelMap, Labels
 from segfloor_ros.core.slam.places.loops import MAX_SLOPE, MAX_STEP_UP_M
 from segfloor_ros.core.slam.rig import Rig
-from segfloor_ros.nodes.map_files import save_map
+from segfloor_ros.nodes.map_files import check_map_output, save_map
 
 KEEPOUT = 'type: 0, base: 0.0, multiplier: 1.0'
 SPEED = 'type: 1, base: 100.0, multiplier: -1.0'
@@ -123,15 +124,19 @@ def export(
     \b
     segfloor map export building.map building.yaml
     """
+    check_map_output(out, [path])
     saved = open_map(path)
     grid, labels = saved.grid(), saved.labels()
+    if labels is None:
+        save_map(grid, out)
+        return console.print(f'map: {out}', soft_wrap=True)
+    beside, picture = (out.with_name(out.stem + n) for n in ('_labels.yaml', '_semantic.png'))
+    check_map_output(beside, [path])
+    check_output(picture, PNG, [path])
     save_map(grid, out)
-    typer.echo(f'map: {out}')
-    if labels is not None:
-        beside, picture = (out.with_name(out.stem + n) for n in ('_labels.yaml', '_semantic.png'))
-        save_labels(beside, grid, labels)
-        write_file(picture, png_bytes(draw_labels(grid, labels)))
-        typer.echo(f'classes: {beside}, {picture}')
+    save_labels(beside, grid, labels)
+    write_output(picture, PNG, marked_png(png_bytes(draw_labels(grid, labels))))
+    console.print(f'map: {out}\nclasses: {beside}, {picture}', soft_wrap=True)
 
 
 @app.command('merge')
@@ -145,8 +150,9 @@ def merge_maps(
     \b
     segfloor map merge robot1.map robot2.map building.map
     """
-    write_map_file(out, merge(open_map(first), open_map(second)).file)
-    typer.echo(f'map: {out}')
+    check_output(out, SAVED_MAP, [first, second])
+    write_map_file(out, merge(open_map(first), open_map(second)).file, [first, second])
+    console.print(f'map: {out}', soft_wrap=True)
 
 
 @app.command('prune')
@@ -159,7 +165,7 @@ def prune_map(
     \b
     segfloor map prune building.map
     """
-    typer.echo(f'map: {prune_file(path)}')
+    console.print(f'map: {prune_file(path)}', soft_wrap=True)
 
 
 @app.command('diff')
@@ -174,8 +180,9 @@ def diff(
     \b
     segfloor map diff monday.map friday.map changes.png
     """
+    check_output(out, PNG, [first, second])
     grid, change = changes(open_map(first), open_map(second))
-    write_file(out, png_bytes(draw_changes(grid, change)))
+    write_output(out, PNG, marked_png(png_bytes(draw_changes(grid, change))))
     areas = {name: grid.area_m2(change == sign) for name, sign in (('appeared', 1), ('gone', -1))}
     if as_json:
         return print_json({f'{name}_m2': round(area, 2) for name, area in areas.items()})
@@ -205,6 +212,7 @@ def filter_labels(
     """
     if bool(keepout) == bool(speed):
         raise SettingsError('give classes by either --keepout or --speed')
+    check_map_output(out, [labels])
     # A speed filter of type 1 with base 100 and multiplier -1 takes off the percentage.
     percent = dict.fromkeys(keepout or (), 100)
     for assignment in speed or ():
@@ -213,7 +221,8 @@ def filter_labels(
             raise SettingsError(f'--speed {assignment}: expected CLASS=PERCENT, 1 to 100')
         percent[name] = 100 - int(share)
     save_map(filter_mask(labels, percent), out, 'raw')
-    typer.echo(f'mask: {out}; costmap_filter_info_server: {KEEPOUT if keepout else SPEED}')
+    words = f'mask: {out}; costmap_filter_info_server: {KEEPOUT if keepout else SPEED}'
+    console.print(words, soft_wrap=True)
 
 
 @dataclass(frozen=True)

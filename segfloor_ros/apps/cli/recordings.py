@@ -14,6 +14,8 @@ from rich.table import Table
 from segfloor_ros.apps.calibration import (
     DICTIONARY,
     FILES,
+    KINDS,
+    PAGE,
     Board,
     CalibrationResult,
     calibrate_folder,
@@ -31,7 +33,9 @@ from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.apps.results_folder import read_summary
 from segfloor_ros.core.camera.recording import DEPTH
 from segfloor_ros.core.errors import InputError, SettingsError, os_errors
+from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.files.results import is_map_file
+from segfloor_ros.core.files.writing import write_output
 from segfloor_ros.core.plugins.rig.check import SETTLED_FRAMES
 from segfloor_ros.core.processes import Interrupt, first_interrupt_noted
 
@@ -52,7 +56,7 @@ def info(
     segfloor info result
     """
     name = options.input
-    path = Path(name).expanduser()
+    path = user_path(name)
     known = _known_output(path)
     if known and as_json:
         return terminal.print_json({'name': name, 'kind': known})
@@ -133,7 +137,8 @@ def record(
 ) -> None:
     """Record topics of the live graph, or a camera of this machine, to a rosbag2 (mcap).
 
-    Ctrl-C, and a disk that becomes full, leave a whole file.
+    Whatever ends it, what is recorded stays in OUT. Ctrl-C, SIGTERM, SIGHUP and a disk that becomes
+    full leave a complete file; a file that lacks its end is read all the same.
 
     \b
     segfloor record drive.mcap
@@ -164,7 +169,10 @@ def _record_topics(out: Path, topics: str | None, seconds: float, interrupt: Int
         dropped = sum(record.dropped for record in pictures)
         status.update(f'{size_mb:.0f} MB, images at {rates} Hz, {dropped} dropped')
 
-    with NewBag(out) as bag, printing.error_console.status('waiting for topics') as status:
+    with (
+        NewBag(out, keeps=True) as bag,
+        printing.error_console.status('waiting for topics') as status,
+    ):
         records, is_full = record_topics(bag, topics, seconds, interrupt, show)
         if not any(record.messages for record in records.values()):
             names = ', '.join(records) or 'none that is wanted'
@@ -184,7 +192,7 @@ def _record_device(
     """Return whether the disk became full."""
     pairs, first_ns, elapsed_s, is_full = 0, 0, 0.0, False
     writing = os_errors(f'{out}: cannot be written')
-    writer = BagWriter(out, source.calibration, images)
+    writer = BagWriter(out, source.calibration, images, keeps=True)
     with writing, writer as bag, terminal.progress_bar('recording', None) as progress:
         for pair in source.raw_pairs():
             bag.write(pair)
@@ -216,17 +224,21 @@ def view(
     segfloor view drive.mcap --every 5
     segfloor view / --live
     """
-    folder = Path(options.input)
-    with open_view(str(out or '')) as shown:
+    folder = user_path(options.input)
+    has_results = not live and (folder / 'summary.json').is_file()
+    source = None
+    if not (live or has_results):  # what cannot be read ends before a window is opened
+        source = open_source(options.configuration().stereo_camera)
+    with open_view(str(out or ''), [options.input, options.params]) as shown:
         assert shown is not None
         if live:
             with terminal.needing_ros('--live'):
                 from segfloor_ros.apps.cli.replay_recorder import watch
             watch(shown, options.input)
-        elif (folder / 'summary.json').is_file():
+        elif source is None:
             show_results(shown, folder)
         else:
-            show_recording(shown, open_source(options.configuration().stereo_camera))
+            show_recording(shown, source)
 
 
 @terminal.with_options
@@ -314,7 +326,7 @@ def calibrate(
 def _print_calibration(result: CalibrationResult, folder: Path) -> None:
     """Print figures of a calibration and the errors of each pair, and write its report."""
     # Imported here: Matplotlib takes a second that other commands should not wait for.
-    from segfloor_ros.apps.evaluation.report import write_calibration_page
+    from segfloor_ros.apps.evaluation.report import calibration_page
 
     table = figure_table('pair', 'left px', 'right px', 'rows px')
     for view, errors_px in zip(result.views, result.view_errors_px, strict=True):
@@ -332,9 +344,9 @@ def _print_calibration(result: CalibrationResult, folder: Path) -> None:
         ('baseline', f'{camera.baseline_m:.4f} m'),
     ]
     console.print(value_table('calibration', rows, str(folder)))
-    page = write_calibration_page(result, rows, folder)
-    for path in (*(folder / name for name in FILES), page):
-        console.print(str(path), soft_wrap=True)
+    write_output(folder / PAGE, KINDS[PAGE], calibration_page(result, rows, folder))
+    for name in (*FILES, PAGE):
+        console.print(str(folder / name), soft_wrap=True)
 
 
 def _check_calibration(source: StereoSource, board: Board | None) -> None:

@@ -28,7 +28,7 @@ from segfloor_ros.apps.cli.replay_recorder import SEMANTIC, SPIN_S, MaskListener
 from segfloor_ros.apps.lockstep import ProgressListener
 from segfloor_ros.apps.programs import program_of
 from segfloor_ros.core.errors import MapError, SegfloorError
-from segfloor_ros.core.files.results import scratch_folder
+from segfloor_ros.core.files.writing import scratch_folder
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.memory import rss_mb
 from segfloor_ros.core.processes import end_with_parent, how_it_ended, interrupts_deferred

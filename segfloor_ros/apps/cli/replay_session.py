@@ -199,7 +199,7 @@ class ReplaySession:
         """Save the map; returns where it is where that is elsewhere, or why it is not saved, else
         ''. Raises MapError.
         """
-        save, load = self.maps.save, self.maps.load
+        save = self.maps.save
         if save is None:
             return ''
         if self.path_only:
@@ -211,8 +211,7 @@ class ReplaySession:
             graph.ask(SetParameters, f'{SLAM}/set_parameters', request)
             graph.call(Trigger, f'{SLAM}/save_map', Trigger.Request(), STALL_S)
 
-        is_own = load is not None and save.resolve() == load.resolve()
-        return self.maps.write(write, interrupted, or_elsewhere=not is_own)
+        return self.maps.write(write, interrupted)
 
     def _check_result(self, recorder: ReplayRecorder, broken: SegfloorError | None) -> None:
         name, notes = self.configuration.stereo_camera.input, recorder.notes

@@ -306,9 +306,14 @@ class DriveOptions(InputOptions):
     view: View = None
 
     @property
+    def inputs(self) -> tuple[Path | str | None, ...]:
+        """All files and folders that are read."""
+        return self.input, self.masks, self.load_map, self.network, self.params
+
+    @property
     def maps(self) -> MapOptions:
         """The maps to go on with and to save. Raises SettingsError where they contradict."""
-        return MapOptions(self.load_map, self.save_map, self.localize)
+        return MapOptions(self.load_map, self.save_map, self.localize, self.inputs)
 
     def open(self) -> tuple[Configuration, StereoSource]:
         """Open the recording, and say what sensors it has."""

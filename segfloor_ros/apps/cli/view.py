@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -49,8 +49,8 @@ from segfloor_ros.core.contracts import (
 )
 from segfloor_ros.core.errors import InputError, SettingsError
 from segfloor_ros.core.files.images import jpeg_bytes, read_mask, read_picture
-from segfloor_ros.core.files.results import check_writable
 from segfloor_ros.core.files.whole import read_text
+from segfloor_ros.core.files.writing import VIEW, check_output
 from segfloor_ros.core.floor.pictures import MASK_COLOURS, mask_overlay
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.grid.occupancy import UNKNOWN_PIXEL, OccupancyGrid
@@ -83,9 +83,11 @@ TIMES, TEXT, ABOUT = 'ms', 'log', 'about'
 
 
 @contextmanager
-def open_view(target: str | None) -> Iterator[View | None]:
-    """Open a window, or a file where `target` names one; None: show nothing. A window stays open
-    after the block. Raises SettingsError where rerun is not installed.
+def open_view(
+    target: str | None, inputs: Iterable[Path | str | None] = ()
+) -> Iterator[View | None]:
+    """Open a window, or a file where `target` names one, which is none of the inputs; None: show
+    nothing. A window stays open after the block. Raises SettingsError where rerun is not installed.
     """
     if target is None:
         yield None
@@ -103,7 +105,7 @@ def open_view(target: str | None) -> Iterator[View | None]:
     if target:
         if not target.endswith(SUFFIX):
             raise SettingsError(f'{target}: the file of a view ends in {SUFFIX}')
-        check_writable(Path(target), 'view')
+        check_output(Path(target), VIEW, inputs, '--view')
         stream.save(target)
     elif os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'):
         stream.spawn()

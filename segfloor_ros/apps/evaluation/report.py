@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import base64
 import html
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from segfloor_ros.apps.calibration import PAGE, CalibrationResult
+from segfloor_ros.apps.calibration import CalibrationResult
 from segfloor_ros.apps.evaluation.map_score import MapScore, compare, overlay_png, score_map
 from segfloor_ros.apps.evaluation.report_pictures import (
     ReportData,
@@ -25,9 +26,12 @@ from segfloor_ros.apps.evaluation.report_pictures import (
 )
 from segfloor_ros.apps.results_folder import REPORT, SEMANTIC, STAGE_COLUMNS, stage_rows
 from segfloor_ros.core.errors import os_errors
-from segfloor_ros.core.files.results import add_files
 from segfloor_ros.core.files.whole import read_bytes
+from segfloor_ros.core.files.writing import MARK, add_files
 from segfloor_ros.core.floor.pictures import MASK_COLOURS
+
+NO_TEXT = re.compile('[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]')
+"""In names of files: what controls a terminal, and bytes that are not UTF-8."""
 
 STYLE = Path(__file__).with_name('report.css')
 
@@ -42,16 +46,16 @@ def write_report(run: Path, truth: Path | None = None) -> Path:
     page = _page(data)
     path = run / REPORT
     with os_errors(f'{path}: cannot be written'):
-        add_files(run, {REPORT: page.encode()})
+        add_files(run, {REPORT: page})
     return path
 
 
-def write_calibration_page(
+def calibration_page(
     result: CalibrationResult, figures: list[tuple[str, str]], folder: Path
-) -> Path:
-    """Write calibration.html beside the files of a calibration and return its path.
+) -> bytes:
+    """Return calibration.html for the files of a calibration in a folder.
 
-    figures: names and values that the page begins with. Raises InputError.
+    figures: names and values that the page begins with.
     """
     names = [', '.join(path.name for path in view.paths) for view in result.views]
     rows = [
@@ -69,14 +73,10 @@ def write_calibration_page(
         _section('The worst pair, rectified', _figure(pair_picture(result), names[0], 'jpeg')),
     ]
     about = 'Errors are RMS: of the corners in each image, of their rows after rectification.'
-    path = folder / PAGE
-    with os_errors(f'{path}: cannot be written'):
-        page = html_page(f'Segfloor: calibration of {folder.name}', about, ''.join(content))
-        add_files(folder, {PAGE: page.encode()})
-    return path
+    return html_page(f'Segfloor: calibration of {folder.name}', about, ''.join(content))
 
 
-def _page(data: ReportData) -> str:
+def _page(data: ReportData) -> bytes:
     sections = [
         _facts(data),
         _section('What to do next', _list(advice(data))),
@@ -92,15 +92,16 @@ def _page(data: ReportData) -> str:
     return html_page(f'Segfloor: {data.name}', about, ''.join(sections))
 
 
-def html_page(title: str, about: str, content: str, style: str = '') -> str:
-    """Return a page with its content in HTML. style: CSS beside that of all pages."""
+def html_page(title: str, about: str, content: str, style: str = '') -> bytes:
+    """Return a page with its content in HTML, in UTF-8. style: CSS beside that of all pages."""
     title = html.escape(title)
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+    text = (
+        f'<!DOCTYPE html>\n<!-- {MARK} -->\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f'<title>{title}</title><style>{STYLE.read_text()}{style}</style></head><body>'
         f'<h1>{title}</h1><p class="sub">{html.escape(about)}</p>{content}</body></html>\n'
     )
+    return NO_TEXT.sub(' ', text).encode()
 
 
 def _facts(data: ReportData) -> str:

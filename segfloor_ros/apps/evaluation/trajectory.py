@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,8 +17,8 @@ from segfloor_ros.apps.recordings.calibration_files import read_body_pose
 from segfloor_ros.apps.recordings.image_folders import TUM_TOLERANCE_S
 from segfloor_ros.apps.trajectory import read_trajectory
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.files.results import write_file
 from segfloor_ros.core.files.whole import number, read_json, read_lines, whole_nanoseconds
+from segfloor_ros.core.files.writing import MARK, PLOTS, check_output, marked_png, write_output
 from segfloor_ros.core.geometry import Array, invert, make_transform
 
 STEP_M = 1.0
@@ -229,8 +230,16 @@ def _file_in(path: Path, name: str) -> Path:
     return path / name if path.is_dir() else path
 
 
+def check_plot(path: Path, inputs: Iterable[Path | str | None] = ()) -> None:
+    """Raise InputError unless a plot can be written to a file: a PNG, SVG or PDF."""
+    suffix = path.suffix.lower() or '.png'
+    if suffix not in PLOTS:
+        raise InputError(f'--plot {path}: a plot is a file {", ".join(PLOTS)}')
+    check_output(path, PLOTS[suffix], inputs, '--plot')
+
+
 def save_trajectory_plot(matched: MatchedTrajectories, path: Path) -> None:
-    """Write a plot of both paths from above and of the error over time.
+    """Write a plot of both paths from above and of the error over time. Raises InputError.
 
     Paths are drawn on the plane in which the true path extends most, its first stretch to the
     right.
@@ -255,8 +264,11 @@ def save_trajectory_plot(matched: MatchedTrajectories, path: Path) -> None:
     error.set(xlabel='time [s]', ylabel='position error [cm]', ylim=(0, None))
     error.grid(alpha=0.3)
     picture = io.BytesIO()
-    figure.savefig(picture, dpi=110, format=path.suffix.lstrip('.') or 'png')
-    write_file(path, picture.getvalue())
+    suffix = path.suffix.lower() or '.png'
+    about = None if suffix == '.png' else {'Creator': MARK}
+    figure.savefig(picture, dpi=110, format=suffix[1:], metadata=about)
+    content = picture.getvalue()
+    write_output(path, PLOTS[suffix], marked_png(content) if suffix == '.png' else content)
 
 
 def plane_axes(path: Array) -> Array:

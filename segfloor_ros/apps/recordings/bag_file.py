@@ -4,8 +4,10 @@ that a ROS install has; and which of its topics are the stereo pair.
 
 from __future__ import annotations
 
+import logging
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from os.path import commonpath
 from pathlib import Path
@@ -14,8 +16,13 @@ from typing import Any, NamedTuple
 from segfloor_ros.apps.recordings.files import SIDES, is_side, side_pairs
 from segfloor_ros.core.camera.recording import StereoCameraSettings
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.files.whole import check_file
+from segfloor_ros.core.files.whole import MAX_BYTES, check_file
 from segfloor_ros.nodes.yaml_files import read_yaml
+
+logger = logging.getLogger(__name__)
+
+MCAP_MAGIC = b'\x89MCAP0\r\n'
+"""At the beginning and the end of an mcap file."""
 
 BAG_SUFFIXES = {'.mcap', '.db3', '.bag'}
 REPAIRS = {'.mcap': 'mcap recover', '.bag': 'rosbag reindex'}
@@ -64,6 +71,7 @@ ReadMessages = Callable[[Sequence[str]], Iterator[tuple[str, Any]]]
 OpenBag = Callable[[Path], tuple[dict[str, Topic], ReadMessages]]
 
 _ros_reader: OpenBag | None = None
+_warned_of: set[Path] = set()
 
 
 def read_rosbag2_with(open_bag: OpenBag | None) -> None:
@@ -114,6 +122,14 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
             found = _ros_reader(path)
         yield BagFile(path, *found)
         return
+    if path.suffix == '.mcap' and _lacks_its_end(path):
+        with _read_errors(path):
+            found = _open_cut_mcap(path)
+        if path not in _warned_of:  # recordings are read more than once
+            _warned_of.add(path)
+            logger.warning('%s: its recording was interrupted; what was written is read', path)
+        yield BagFile(path, *found)
+        return
     with _rosbags_reader(path) as (reader, decode):
 
         def read(names: Sequence[str]) -> Iterator[tuple[str, Any]]:
@@ -124,6 +140,46 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
         with _read_errors(path):
             topics = {n: _topic(path, n, info) for n, info in reader.topics.items()}
         yield BagFile(path, topics, read)
+
+
+def _lacks_its_end(path: Path) -> bool:
+    """Whether an mcap file was begun, but not completed."""
+    with _read_errors(path), path.open('rb') as file:
+        begins = file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+        file.seek(max(path.stat().st_size - len(MCAP_MAGIC), 0))
+        return begins and file.read() != MCAP_MAGIC
+
+
+def _open_cut_mcap(path: Path) -> tuple[dict[str, Topic], ReadMessages]:
+    """Return topics and messages of the complete chunks of an mcap file (https://mcap.dev/spec)."""
+    from mcap.exceptions import McapError
+    from mcap.records import Channel, Message, Schema
+    from mcap.stream_reader import StreamReader
+    from rosbags.typesys import Stores, get_typestore
+
+    decode = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
+
+    def messages() -> Iterator[tuple[str, str, bytes]]:
+        kinds: dict[int, str] = {}
+        topics: dict[int, tuple[str, str]] = {}
+        with path.open('rb') as file, suppress(McapError):
+            for record in StreamReader(file, record_size_limit=MAX_BYTES).records:
+                if isinstance(record, Schema):
+                    kinds[record.id] = record.name
+                elif isinstance(record, Channel):
+                    topics[record.id] = record.topic, kinds[record.schema_id]
+                elif isinstance(record, Message):
+                    yield *topics[record.channel_id], record.data
+
+    def read(names: Sequence[str]) -> Iterator[tuple[str, Any]]:
+        for topic, kind, data in messages():
+            if topic in names:
+                yield topic, decode(data, kind)
+
+    counts = Counter((topic, kind) for topic, kind, _ in messages())
+    if not counts:
+        raise ValueError('it ends before its first chunk does')
+    return {topic: Topic(kind, count) for (topic, kind), count in counts.items()}, read
 
 
 def _topic(path: Path, name: str, info: Any) -> Topic:

@@ -24,7 +24,7 @@ from segfloor_ros.core.camera.recording import IMU_FRAME, MeasurementLog, RawPai
 from segfloor_ros.core.contracts import ImuSample, Measurement, WheelPose
 from segfloor_ros.core.errors import InputError, os_errors
 from segfloor_ros.core.files.images import jpeg_bytes, png_bytes
-from segfloor_ros.core.files.results import scratch_folder
+from segfloor_ros.core.files.writing import scratch_folder
 from segfloor_ros.core.geometry import Array, make_transform
 from segfloor_ros.core.quaternions import quaternion_xyzw
 
@@ -179,41 +179,52 @@ class NewBag:
     """A new bag of serialised messages: one file where its name ends in `.mcap`, else a rosbag2
     folder. compressed: in zstd chunks. bytes: of the messages so far.
 
-    It appears when it is complete; after an error nothing is left. Raises
-    InputError when `out` exists or cannot be written.
+    keeps: whether what is written stays, whatever ends the recording: it is at its final place from
+    the first message on. Else the bag appears when it is complete, and after an error nothing is
+    left. Raises InputError when `out` exists or cannot be written.
     """
 
-    def __init__(self, out: Path, compressed: bool = False) -> None:
+    def __init__(self, out: Path, compressed: bool = False, keeps: bool = False) -> None:
         self._out = out
+        self._keeps = keeps
         self._compressed = compressed
         self._stack = ExitStack()
         self._topics: set[str] = set()
         self.bytes = 0
 
     def __enter__(self) -> NewBag:
-        if os.path.lexists(self._out):
-            raise InputError(f'{self._out}: exists already; remove it or choose another name')
-        with os_errors(f'{self._out}: cannot be written'):
-            self._out.parent.mkdir(parents=True, exist_ok=True)
-            self._staging = self._stack.enter_context(scratch_folder(self._out.parent))
+        out, is_file = self._out, self._out.suffix == '.mcap'
+        if os.path.lexists(out):
+            raise InputError(f'{out}: exists already; choose another name')
         try:
-            self.library = (_ros_library or Rosbags)(
-                self._staging / self._out.stem, self._compressed
-            )
+            with os_errors(f'{out}: cannot be written'):
+                out.parent.mkdir(parents=True, exist_ok=True)
+                self._folder = self._stack.enter_context(scratch_folder(out.parent)) / out.stem
+                if self._keeps and not is_file:
+                    self._folder = out
+                self.library = (_ros_library or Rosbags)(self._folder, self._compressed)
+                if is_file:
+                    (self._file,) = self._folder.glob('*.mcap')
+                    os.link(self._file, out)  # the same file by two names
+                    if not self._keeps:
+                        out.unlink()
         except ImportError:
             self._stack.close()
-            raise InputError(f'{self._out}: {MISSING_LIBRARY}') from None
+            raise InputError(f'{out}: {MISSING_LIBRARY}') from None
+        except InputError:
+            self._stack.close()
+            raise
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        out, is_file = self._out, self._out.suffix == '.mcap'
+        is_whole = kind is None or (self._keeps and bool(self._topics))
         try:
-            self.library.close(is_whole=kind is None)
-            if kind is not None:
-                return
-            bag = self._staging / self._out.stem
-            if self._out.suffix == '.mcap':
-                (bag,) = bag.glob('*.mcap')
-            bag.rename(self._out)
+            self.library.close(is_whole)
+            if not is_whole and self._keeps:
+                out.unlink() if is_file else shutil.rmtree(out)
+            if is_whole and not self._keeps:
+                (self._file if is_file else self._folder).rename(out)
         finally:
             self._stack.close()
 
@@ -236,16 +247,20 @@ class NewBag:
         as fast as in the seconds so far.
         """
         next_bytes = RESERVE_S * self.bytes / max(elapsed_s, 1.0)
-        return shutil.disk_usage(self._staging).free < LEAST_FREE_BYTES + next_bytes
+        return shutil.disk_usage(self._folder).free < LEAST_FREE_BYTES + next_bytes
 
 
 class BagWriter:
     """A new bag of stereo pairs."""
 
     def __init__(
-        self, out: Path, calibration: StereoCalibration, coding: ImageCoding = ImageCoding.raw
+        self,
+        out: Path,
+        calibration: StereoCalibration,
+        coding: ImageCoding = ImageCoding.raw,
+        keeps: bool = False,
     ) -> None:
-        self.file = NewBag(out, compressed=coding is ImageCoding.raw)
+        self.file = NewBag(out, coding is ImageCoding.raw, keeps)
         self._calibration = calibration
         self._coding = coding
 

@@ -16,6 +16,7 @@ from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibrati
 from segfloor_ros.core.camera.recording import StereoCameraSettings
 from segfloor_ros.core.errors import CalibrationError
 from segfloor_ros.core.files.whole import number, read_lines
+from segfloor_ros.core.files.writing import MARK
 from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.nodes.yaml_files import read_yaml
 
@@ -120,7 +121,8 @@ def ros_calibration(eye: EyeCalibration, camera_name: str) -> str:
         'rectification_matrix': matrix(eye.R, 3),
         'projection_matrix': matrix(eye.P, 3),
     }
-    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
+    return f'# {MARK}\n{text}'
 
 
 def write_ros_calibration(path: Path, eye: EyeCalibration, camera_name: str) -> None:

@@ -43,6 +43,7 @@ from segfloor_ros.core.camera.images import to_grey
 from segfloor_ros.core.camera.pixels import Grey
 from segfloor_ros.core.camera.recording import RecordedSensor, StereoCameraSettings
 from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.files.whole import check_file
 from segfloor_ros.core.plugins.rig.check import BURST, RigCheck
 from segfloor_ros.core.standard_error import silent_libraries
@@ -84,7 +85,7 @@ def open_source(settings: StereoCameraSettings) -> StereoSource:
     if not settings.input:
         raise InputError(f'no input is given; set stereo_camera.input to {KINDS}')
     try:
-        path = Path(settings.input).expanduser()
+        path = user_path(settings.input)
         if not (path.exists() or is_device(path)):
             raise InputError(f'{path}: no such file or folder; give {KINDS}')
         kind = _kind(path)
@@ -97,7 +98,7 @@ def open_source(settings: StereoCameraSettings) -> StereoSource:
             )
         source.cut(settings.start, settings.frames, settings.every)
         if settings.masks:
-            source.masks = MaskFolder(Path(settings.masks).expanduser(), source.camera)
+            source.masks = MaskFolder(user_path(settings.masks), source.camera)
         return source
     except OSError as error:
         raise InputError(

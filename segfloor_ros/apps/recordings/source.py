@@ -24,9 +24,10 @@ from segfloor_ros.core.camera.pixels import Grey
 from segfloor_ros.core.camera.recording import DEPTH, RawPair, RecordedSensor
 from segfloor_ros.core.camera.rectification import StereoRectifier
 from segfloor_ros.core.contracts import StereoFrame
-from segfloor_ros.core.errors import CorruptImageError, InputError
+from segfloor_ros.core.errors import CalibrationError, CorruptImageError, InputError
 from segfloor_ros.core.files.images import check_same_size, read_mask
 from segfloor_ros.nodes.shared.joining import Stamped, StampJoiner
+from segfloor_ros.nodes.shared.stamp_order import AGREEING, InTime, StampOrder
 
 PLAUSIBLE_HZ = 0.1, 1000.0
 """Pairs per second of a robot's camera; others come of times in another unit."""
@@ -114,6 +115,7 @@ class StereoSource:
         self._part = slice(0, None)
         self.skipped_frames = 0
         self._warned_of: set[int] = set()
+        self._has_read_pair = self._has_read_mask = False
         self._eight_bit = EightBitScale(bit_depth)
         self._check_first_pair()
         slowest, fastest = PLAUSIBLE_HZ
@@ -180,11 +182,20 @@ class StereoSource:
         return None if pair is None else self._rectified_pair(pair)
 
     def _rectified(self) -> Iterator[StereoFrame]:
-        return (self._rectified_pair(pair) for pair in self._decoded())
+        frames = map(self._rectified_pair, self._decoded())
+        return (frame for frame in frames if frame is not None)
 
-    def _rectified_pair(self, pair: RawPair) -> StereoFrame:
+    def _rectified_pair(self, pair: RawPair) -> StereoFrame | None:
+        """Return a pair rectified; None where its mask cannot be read, and others could."""
+        try:
+            mask = self.mask(pair.index)
+        except InputError as error:
+            if not self._has_read_mask:
+                raise
+            self.skip(pair.index, str(error))
+            return None
+        self._has_read_mask |= mask is not None
         left, right = self._rectifier.rectify(pair.left, pair.right)
-        mask = self.mask(pair.index)
         excluded = self._rectifier.rectify_mask(mask) if mask is not None else None
         colour = None if pair.colour is None else self._rectifier.rectify_colour(pair.colour)
         return StereoFrame(pair.index, pair.stamp_ns, left, right, excluded, colour)
@@ -205,7 +216,14 @@ class StereoSource:
             (right, 'the depth image of frame' if is_depth else 'frame'),
         ):
             what = f'{self.name}: {kind} {entry.index}'
-            self.calibration.check_size(image.shape[1], image.shape[0], what)
+            try:
+                self.calibration.check_size(image.shape[1], image.shape[0], what)
+            except CalibrationError as error:
+                if not self._has_read_pair:
+                    raise
+                self.skip(entry.index, str(error))
+                return None
+        self._has_read_pair = True
         colour, left = left if left.ndim == 3 else None, to_grey(left)
         if is_depth:
             left, right = self._eight_bit(left, left)[0], right.astype(np.float32, copy=False)
@@ -263,27 +281,46 @@ class StampPairing(Generic[T]):
     """Pairs the images of a recording, and yields the pairs in the order of their stamps.
 
     Images are added in the order of their arrival, side 0 the left, side 1 the right. A pair that
-    comes one place late is put where it belongs; an image that comes later still means that the
-    clock went backwards, an InputError. At most `limit` images wait. names: of both sides, for
-    messages.
+    comes one place late is put where it belongs; where the clock went backwards, several in a row
+    say so, an InputError. At most `limit` images wait. names: of both sides, for messages.
 
     pairs, and by side: unpaired, images without a partner; duplicates, images with a stamp that
-    was there before.
+    was there before; elsewhere, single images with a stamp that is far from those around it.
     """
 
     def __init__(self, tolerance_s: float, names: tuple[str, str], limit: int = 64) -> None:
         self.pairs = 0
         self.unpaired = [0, 0]
         self.duplicates = [0, 0]
+        self.elsewhere = [0, 0]
         self._tolerance_s = tolerance_s
         self._names = names
         self._joiner = StampJoiner(names, limit, round(tolerance_s * 1e9))
         self._latest: list[list[int]] = [[], []]
+        self._orders = StampOrder(), StampOrder()
+        self._uncertain: tuple[list[tuple[int, T]], list[tuple[int, T]]] = [], []
         self._alone: list[list[int]] = [[], []]
         self._held: list[tuple[Stamped[T], Stamped[T]]] = []
 
     def add(self, side: int, stamp_ns: int, item: T) -> Iterator[tuple[Stamped[T], Stamped[T]]]:
         """Take in an image and yield the pairs that are complete now, but the last one."""
+        order, uncertain = self._orders[side], self._uncertain[side]
+        found = order.take(stamp_ns)
+        if found is InTime.ELSEWHERE:
+            uncertain.append((stamp_ns, item))
+        surplus = len(uncertain) - (
+            AGREEING - 1 if found is InTime.JUMPED else len(order.elsewhere_ns)
+        )
+        self.elsewhere[side] += surplus
+        del uncertain[:surplus]
+        if found is InTime.JUMPED:
+            for one in uncertain:
+                yield from self._add(side, *one)
+            uncertain.clear()
+        if found is not InTime.ELSEWHERE:
+            yield from self._add(side, stamp_ns, item)
+
+    def _add(self, side: int, stamp_ns: int, item: T) -> Iterator[tuple[Stamped[T], Stamped[T]]]:
         latest, name = self._latest[side], self._names[side]
         if stamp_ns in latest:
             self.duplicates[side] += 1
@@ -302,6 +339,8 @@ class StampPairing(Generic[T]):
 
     def finish(self) -> Iterator[tuple[Stamped[T], Stamped[T]]]:
         """Yield the last pair; nothing is added after this."""
+        for side in (0, 1):
+            self.elsewhere[side] += len(self._uncertain[side])
         yield from self._held
         self._joiner.give_up()
         self._count_dropped()
@@ -322,6 +361,10 @@ class StampPairing(Generic[T]):
             logger.warning('%s: %d and %d images have no partner', names, *self.unpaired)
         if any(self.duplicates):
             logger.warning('%s: %d and %d images came twice', names, *self.duplicates)
+        if any(self.elsewhere):
+            logger.warning(
+                '%s: %d and %d images have a stamp of another time', names, *self.elsewhere
+            )
 
     def _count_dropped(self) -> None:
         for dropped in self._joiner.take_dropped():

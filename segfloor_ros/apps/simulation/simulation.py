@@ -40,7 +40,7 @@ from segfloor_ros.apps.simulation.solids import CLASSES, floors, obstacles, true
 from segfloor_ros.apps.simulation.world import CAMERAS, View, WorldRenderer, build_world
 from segfloor_ros.core.errors import InputError, os_errors
 from segfloor_ros.core.files.images import png_bytes
-from segfloor_ros.core.files.results import RENDERED, folder_in_the_making, move_into_place
+from segfloor_ros.core.files.writing import check_target, folder_in_the_making, move_into_place
 from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.grid.occupancy import OCCUPIED, OccupancyGrid
 from segfloor_ros.core.quaternions import quaternion_xyzw
@@ -237,6 +237,17 @@ def _check_clear(grid: OccupancyGrid, drive: Drive) -> None:
         raise InputError(f'the path runs into an obstacle at x {x:.2f}, y {y:.2f} m')
 
 
+RENDERED = 'rendered_from.txt'
+"""In a rendered drive of the cache: of what."""
+
+RECORDED = (
+    'image_0', 'image_1', 'left', 'right', 'left.yaml', 'right.yaml', 'calib.txt', 'times.txt',
+    'poses.txt', 'base_poses.txt', 'scene.yaml', 'map.yaml', 'map.pgm', 'wheel_odometry.txt',
+    'imu.csv', 'imu.yaml', 'depth', 'floor', 'disparity', 'labels', 'instances', 'moving', RENDERED,
+)  # fmt: skip
+"""All that a rendered drive may hold."""
+
+
 @dataclass(frozen=True)
 class RecordingOptions:
     """What to write. floor_every: every how many frames a floor mask, 0 for none. disparity: a true
@@ -259,10 +270,9 @@ def record(
 
     Rectified images go to image_0/ and image_1/ with calib.txt (KITTI odometry layout), others to
     left/ and right/ with ROS calibrations left.yaml and right.yaml; what wheels, IMU and depth
-    camera tell goes beside them. Raises InputError when `out` holds something already.
+    camera tell goes beside them. Raises InputError when `out` holds something else already.
     """
-    if out.is_symlink() or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
-        raise InputError(f'{out}: exists already; choose another --out or remove it')
+    check_target(out, RECORDED)
     with folder_in_the_making(out) as made, os_errors(f'{out}: cannot be written'):
         _record_into(made, simulation, options, on_frame)
         move_into_place(made, out)

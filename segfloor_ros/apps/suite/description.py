@@ -11,6 +11,7 @@ from typing import Any
 from segfloor_ros.apps.suite.measures import HIGHER, LOWER, MEASURES, Bound, Slack
 from segfloor_ros.apps.suite.result_files import find_recordings, is_url
 from segfloor_ros.core.errors import SegfloorError, SettingsError
+from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.files.whole import number as finite_number
 from segfloor_ros.core.settings import suggestion
 from segfloor_ros.nodes.configuration import resolve
@@ -303,7 +304,7 @@ class _Reader:
         """Return a path, relative to the folder of the recordings, in full; a URL as it is."""
         if is_url(text):
             return text
-        return str(self._folder / Path(text).expanduser())
+        return str(self._folder / user_path(text))
 
     def _at(self, name: str) -> Key:
         own: Key = (*self._key, name)

@@ -33,7 +33,7 @@ from segfloor_ros.apps.suite.description import REPLAY, RESULTS, SCENE, Entry
 from segfloor_ros.apps.suite.measures import Outcome, measure_run, start_pose_of
 from segfloor_ros.apps.suite.result_files import Cache, digest_of, local_copy, pack, unpack
 from segfloor_ros.core.errors import SegfloorError, SettingsError, without_credentials
-from segfloor_ros.core.files.results import scratch_folder
+from segfloor_ros.core.files.writing import scratch_folder
 from segfloor_ros.core.processes import (
     end_with_parent,
     how_it_ended,
@@ -197,7 +197,7 @@ def _recording(entry: Entry, folder: Path) -> Path:
     scene = open_scene(entry.input, entry.scene_assignments)
     recording = folder / 'renderings' / _digest_of_text(repr((__version__, scene)))
     recording.parent.mkdir(parents=True, exist_ok=True)
-    with recording.with_suffix('.lock').open('w') as lock:
+    with recording.with_suffix('.lock').open('a') as lock:
         # Another worker may want the same drive.
         fcntl.flock(lock, fcntl.LOCK_EX)
         render_once(scene, recording, RecordingOptions())

@@ -18,9 +18,9 @@ from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.results_folder import read_summary
 from segfloor_ros.apps.trajectory import read_trajectory
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.files.results import write_file
 from segfloor_ros.core.files.whole import number as finite_number
 from segfloor_ros.core.files.whole import read_json
+from segfloor_ros.core.files.writing import Kind, write_output
 from segfloor_ros.core.geometry import Pose2d
 from segfloor_ros.core.grid.occupancy import UNKNOWN, OccupancyGrid
 
@@ -333,10 +333,10 @@ def check(outcome: Outcome, bounds: Iterable[Bound]) -> Checked:
 
 
 def write_baseline(result: SuiteResult, path: Path) -> None:
-    """Write the measures of all recordings that have a map."""
+    """Write the measures of all recordings that have a map. Raises InputError."""
     measures = {c.name: dict(c.measured) for c in result.recordings if not c.problem}
     document = {'recordings': measures}
-    write_file(path, (json.dumps(document, indent=2) + '\n').encode())
+    write_output(path, BASELINE, (json.dumps(document, indent=2) + '\n').encode())
 
 
 def is_baseline(path: Path) -> bool:
@@ -346,6 +346,9 @@ def is_baseline(path: Path) -> bool:
     except InputError:
         return False
     return True
+
+
+BASELINE = Kind('baseline', is_baseline)
 
 
 def read_baseline(path: Path) -> Baseline:

@@ -24,8 +24,8 @@ from segfloor_ros.apps.results_folder import REPORT
 from segfloor_ros.apps.suite.measures import MEASURES, Checked, SuiteResult, known_measures, number
 from segfloor_ros.core.errors import InputError, printable, without_credentials
 from segfloor_ros.core.files.images import png_bytes, read_mask
-from segfloor_ros.core.files.results import folder_in_the_making, move_into_place, scratch_folder
 from segfloor_ros.core.files.whole import read_json
+from segfloor_ros.core.files.writing import folder_in_the_making, move_into_place, scratch_folder
 from segfloor_ros.core.grid.occupancy import UNKNOWN_PIXEL
 
 MEASURED = 'measured.json'
@@ -198,7 +198,7 @@ def page(result: SuiteResult, folder: Path) -> bytes:
     complaints = f'<h2>What fails</h2><ul>{failed}</ul>' if failed else ''
     about = f'{kept} of {len(result.recordings)} recordings are as they should be'
     table = f'<h2>Recordings</h2><table><tr>{head}</tr>{rows}</table>'
-    return html_page(printable(result.name), about, complaints + table, MARKS).encode()
+    return html_page(printable(result.name), about, complaints + table, MARKS)
 
 
 def _row(checked: Checked, folder: Path) -> str:

@@ -88,10 +88,12 @@ class KeptState:
         with contextlib.suppress(OSError):
             self.file.parent.mkdir(mode=0o700, exist_ok=True)
             self._check_private()
-            from segfloor_ros.core.files.results import replacing, write_to
+            from segfloor_ros.core.files.results import write_to
 
-            with replacing(self.file) as file:
+            written = self.file.with_suffix('.part')
+            with written.open('wb') as file:
                 write_to(file, saved, compress=False)
+            written.replace(self.file)
         now_s = time.monotonic()
         self._next_save_s = now_s + LEAST_SHARE * (now_s - start_s)
 
@@ -128,7 +130,7 @@ class KeptState:
         self.finish()
         with contextlib.suppress(OSError):
             self._check_private()
-            for file in (self.file, self._note):
+            for file in (self.file, self._note, self.file.with_suffix('.part')):
                 file.unlink(missing_ok=True)
 
     def _check_private(self) -> None:

@@ -116,6 +116,9 @@ def run_nodes(make_nodes: Callable[[], Sequence[Node]]) -> None:
     status = 0
     nodes: Sequence[Node] = ()
     signal.signal(signal.SIGINT, _interrupt)
+    for number in (signal.SIGTERM, signal.SIGHUP):  # rclpy handles SIGTERM later
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _interrupt)
     try:
         _share_one_heap()
         cv2.setNumThreads(-1)  # OpenCV with TBB asks the environment only then

@@ -6,6 +6,7 @@ import time
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Sequence
+from inspect import isawaitable
 from typing import Any, Generic, TypeVar
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -33,8 +34,9 @@ DONE, REFUSED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILU
 class Outputs:
     """What a node offers from when it is configured until it is cleaned up: topics, services."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, reporter: Reporter) -> None:
         self._node = node
+        self._reporter = reporter
         self._steps: list[Callable[[], Any]] = []
         self.publishers: dict[str, Publisher] = {}
         """Those of `TOPICS` by name."""
@@ -59,23 +61,34 @@ class Outputs:
         return count
 
     def service(self, kind: Any, name: str, answer: Callable[[Any, Any], Any]) -> None:
-        """Offer a service. answer: may be a coroutine; the node works on while it waits."""
+        """Offer a service whose response has `success` and `message`; what `answer` raises becomes
+        the message. answer: may be a coroutine; the node works on while it waits.
+        """
+
+        async def answer_always(request: Any, response: Any) -> Any:
+            try:
+                answered = answer(request, response)
+                return await answered if isawaitable(answered) else answered
+            except Exception as error:  # whatever it is, the node lives on
+                if not isinstance(error, (SegfloorError, OSError)):
+                    self._reporter.log_fault(name, error)
+                response.success = False
+                response.message = str(error) or type(error).__name__
+                return response
+
         group = ReentrantCallbackGroup()
-        made = self._node.create_service(kind, name, answer, callback_group=group)
+        made = self._node.create_service(kind, name, answer_always, callback_group=group)
         self.at_clean_up(lambda: self._node.destroy_service(made))
 
     def trigger(self, name: str, work: Callable[[], str | Awaitable[str]]) -> None:
         """Offer a service that does some work and answers with its message, or with why it failed.
-        work: may return an awaitable; raises SegfloorError or OSError.
+        work: may return an awaitable.
         """
 
         async def answer(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            try:
-                message = work()
-                response.message = message if isinstance(message, str) else await message
-                response.success = True
-            except (SegfloorError, OSError) as error:
-                response.message = str(error)
+            message = work()
+            response.message = message if isinstance(message, str) else await message
+            response.success = True
             return response
 
         self.service(Trigger, name, answer)
@@ -239,7 +252,7 @@ class StageNode(LifecycleNode, ABC, Generic[Settings]):
         self.parameters = NodeParameters(self, settings(), lambda: self.on_settings_changed())
         self.reporter = Reporter(self)
         self.inputs = Inputs(self, self.reporter)
-        self.outputs = Outputs(self)
+        self.outputs = Outputs(self, self.reporter)
         self.kept_state = KeptState(self.get_fully_qualified_name(), self.settings.resume_within_s)
         self.states = States(self)
         publishers, subscriptions = self.outputs.publishers, self.inputs.subscriptions
@@ -295,7 +308,7 @@ class StageNode(LifecycleNode, ABC, Generic[Settings]):
 
     def reset(self, reason: str) -> None:
         """Drop the map and begin with an empty one, with one line in the log."""
-        self.get_logger().info(f'reset: {reason}')
+        self.get_logger().warning(f'reset: {reason}')
         self.kept_state.remove()
         self.reset_stage()
 

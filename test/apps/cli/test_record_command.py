@@ -8,6 +8,7 @@ import signal
 import struct
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -78,6 +79,62 @@ def test_what_a_camera_publishes_is_in_the_bag_and_a_lost_frame_is_counted(
     found = list(source.frames())
     assert [f.stamp_ns for f in found] == [f.stamp_ns for f in frames if f.index != LOST]
     assert np.array_equal(found[0].left, frames[0].left)
+
+
+RECORDER = """
+import sys, time
+from pathlib import Path
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.apps.recordings.bag_writer import BagWriter, ImageCoding
+from segfloor_ros.core.camera.recording import StereoCameraSettings
+source = open_source(StereoCameraSettings(input=sys.argv[1]))
+with BagWriter(Path(sys.argv[2]), source.calibration, ImageCoding.raw, keeps=True) as bag:
+    for pair in source.raw_pairs():
+        bag.write(pair)
+    print(flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize('name', ['out.mcap', 'out'])
+def test_what_a_killed_recorder_wrote_is_read(tmp_path, name) -> None:
+    """The file or folder is there by its name from the beginning."""
+    pytest.importorskip('rosbags')
+    from stereo_drive import write_kitti
+
+    frames, out = room_drive(40)[0], tmp_path / 'bags' / name
+    drive = write_kitti(tmp_path / 'drive', frames)
+    words = [sys.executable, '-c', RECORDER, str(drive), str(out)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, cwd=Path(__file__).parents[3]) as process:
+        process.stdout.readline()
+        process.kill()
+    found = list(open_source(StereoCameraSettings(input=str(out))).frames())
+    assert len(found) > 0.8 * len(frames)
+    assert [f.stamp_ns for f in found] == [f.stamp_ns for f in frames[: len(found)]]
+    assert np.array_equal(found[-1].left, frames[len(found) - 1].left)
+    done = segfloor('convert', drive, tmp_path / 'next.mcap')  # removes what is left
+    assert done.returncode == 0, done.stderr
+    assert [path.name for path in out.parent.iterdir()] == [name]
+
+
+@pytest.mark.parametrize('number', [signal.SIGHUP, signal.SIGTERM])
+def test_a_signal_completes_the_recording(recording, tmp_path, number) -> None:
+    graph, publishers = recording.graph, recording.publishers
+    graph.connected(list(publishers.values()))
+    graph.comes(lambda: False, 0.5)
+    for frame in room_drive(3)[0]:
+        for side in SIDES:
+            info = camera_info_message(frame.stamp_ns, f'{side}_eye', getattr(CALIBRATION, side))
+            image = image_message(frame.stamp_ns, f'{side}_eye', getattr(frame, side))
+            publishers[f'{side}/camera_info'].publish(info)
+            publishers[f'{side}/image_raw'].publish(image)
+    assert all(publisher.wait_for_all_acked(ARRIVAL) for publisher in publishers.values())
+    recording.process.send_signal(number)
+    _, err = recording.process.communicate(timeout=STOP_S)
+    assert recording.process.returncode == 0, err
+    assert [path.name for path in tmp_path.iterdir()] == ['out.mcap']
+    source = open_source(StereoCameraSettings(input=str(tmp_path / 'out.mcap')))
+    assert len(list(source.frames())) == 3
 
 
 def test_where_nothing_comes_no_file_is_left(make_graph, tmp_path) -> None:

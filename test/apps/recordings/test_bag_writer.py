@@ -112,7 +112,7 @@ def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
     out = tmp_path / 'drive.mcap'
     out.write_text('precious')
     with (
-        pytest.raises(InputError, match=r'drive.mcap: exists already; remove it or choose'),
+        pytest.raises(InputError, match=r'drive.mcap: exists already; choose'),
         BagWriter(out, source.calibration),
     ):
         pass

@@ -35,11 +35,24 @@ def test_a_mask_of_another_size_is_named(drive, tmp_path):
         list(source.frames())
 
 
-def test_a_file_that_is_no_image_is_named(drive, tmp_path):
-    write_mask(tmp_path / 'masks', 0, np.zeros((HEIGHT, WIDTH), np.uint8))
+def test_a_file_that_is_no_image_is_named_and_its_frame_alone_is_lost(drive, tmp_path, caplog):
+    (tmp_path / 'masks').mkdir()
     (tmp_path / 'masks' / '000001.png').write_bytes(b'nothing')
     with pytest.raises(InputError, match=r'000001\.png: the image cannot be decoded'):
         list(opened(drive, masks=str(tmp_path / 'masks')).frames())
+    write_mask(tmp_path / 'masks', 0, np.zeros((HEIGHT, WIDTH), np.uint8))
+    source = opened(drive, masks=str(tmp_path / 'masks'))
+    assert [frame.index for frame in source.frames()] == [0, 2]
+    assert source.skipped_frames == 1
+    assert 'frame 1 is skipped' in caplog.text and '000001.png: the image cannot be' in caplog.text
+
+
+def test_an_image_of_another_size_is_lost_alone(drive, caplog):
+    path = drive / 'image_1' / '000001.png'
+    cv2.imwrite(str(path), cv2.imread(str(path))[:, 4:])
+    source = opened(drive)
+    assert [frame.index for frame in source.frames()] == [0, 2]
+    assert f'frame 1 is {WIDTH - 4}x{HEIGHT}' in caplog.text
 
 
 def test_a_folder_without_masks_is_refused(drive, tmp_path):

@@ -93,3 +93,32 @@ def test_without_a_single_pair_the_distance_is_told() -> None:
     assert pairs_of(matcher, 'L0 R30 L100 R125') == []
     with pytest.raises(InputError, match=r'within 0.01 s; the nearest are 0.025.* raise stereo_c'):
         matcher.report()
+
+
+@pytest.mark.parametrize(
+    'wrong', ['L0 R0', 'L5000 R5000', 'L99999000 R99999000', 'L3000', 'L0 R9000']
+)
+def test_a_stamp_of_another_time_costs_its_image_alone(wrong, caplog) -> None:
+    matcher = pairing()
+    around = 'L10000 R10000 L10100 R10100', 'L10200 R10200 L10300 R10300 L10400 R10400'
+    found = pairs_of(matcher, f'{around[0]} {wrong} {around[1]}')
+    assert found == [(ms, ms) for ms in range(10000, 10500, 100)]
+    assert matcher.elsewhere == [wrong.count('L'), wrong.count('R')]
+    matcher.report()
+    assert 'have a stamp of another time' in ' '.join(caplog.text.split())
+
+
+def test_after_a_pause_no_image_is_lost() -> None:
+    arrivals = [f'L{ms} R{ms}' for ms in (0, 100, 200, 60000, 60100, 60200, 60300)]
+    assert [left for left, _ in pairs_of(pairing(), ' '.join(arrivals))] == [
+        *(0, 100, 200, 60000, 60100, 60200, 60300)
+    ]
+
+
+def test_a_clock_that_goes_backwards_is_said_when_several_images_agree() -> None:
+    matcher = pairing()
+    pairs_of(matcher, 'L10000 R10000 L10100 R10100 L10200 R10200')
+    list(matcher.add(0, 0, 0))
+    list(matcher.add(0, 100 * MS, 100))
+    with pytest.raises(InputError, match='goes backwards'):
+        list(matcher.add(0, 200 * MS, 200))

@@ -183,8 +183,12 @@ def test_recording_has_the_layout_of_a_kitti_folder_with_truth(room, tmp_path):
     np.testing.assert_allclose(poses[-1], T_first_last, atol=1e-6)
     rows = dict(line.split(':') for line in (out / 'calib.txt').read_text().splitlines())
     assert float(rows['P1'].split()[3]) == pytest.approx(-80.0 * 0.12)
-    with pytest.raises(InputError, match='exists already'):
+    record(room, out, RecordingOptions(floor_every=0))
+    assert not (out / 'floor').exists()
+    (out / 'times.txt').write_text('mine')
+    with pytest.raises(InputError, match=r'holds times\.txt'):
         record(room, out, RecordingOptions())
+    assert (out / 'times.txt').read_text() == 'mine'
 
 
 def test_labels_say_what_each_pixel_shows_and_whose_it_is(tmp_path):

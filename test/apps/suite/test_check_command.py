@@ -222,7 +222,7 @@ def test_a_recording_is_not_taken_for_its_results(room, tmp_path, monkeypatch):
     (tmp_path / 'out' / 'aisle' / 'floor_masks' / 'mine').write_text('mine')
     done = check(suite, '--out', 'out')
     assert done.returncode == 2
-    assert 'out/aisle: holds floor_masks, which segfloor did not write' in done.stderr
+    assert 'out: holds files and no .segfloor_result' in done.stderr
     assert (tmp_path / 'out' / 'aisle' / 'floor_masks' / 'mine').read_text() == 'mine'
 
 
