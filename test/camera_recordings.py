@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from segfloor_ros.apps.recordings import StereoSource, open_source
 from segfloor_ros.apps.recordings.calibration_files import write_ros_calibration
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 
 WIDTH, HEIGHT = 64, 48
 FX, BASELINE_M = 50.0, 0.2

@@ -22,7 +22,7 @@ from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.bag_writer import convert
 from segfloor_ros.apps.recordings.calibration_files import write_ros_calibration
 from segfloor_ros.core.camera.calibration import EyeCalibration
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.contracts import FLOOR, NOT_FLOOR
 
 FRAMES = 4

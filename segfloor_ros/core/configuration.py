@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.cloud import CloudLabellingSettings
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.grid.occupancy import OccupancyGridSettings

@@ -17,8 +17,13 @@ from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image, Imu
 
-from segfloor_ros.core.camera.measurements import imu_sample, measures_motion, wheel_pose, xyz
-from segfloor_ros.core.camera.recording import is_upright
+from segfloor_ros.core.camera.measurements import (
+    imu_sample,
+    is_upright,
+    measures_motion,
+    wheel_pose,
+    xyz,
+)
 from segfloor_ros.core.camera.rectification import StereoRectifier
 from segfloor_ros.core.contracts import Measurement, WheelPose
 from segfloor_ros.core.geometry import Array, make_transform

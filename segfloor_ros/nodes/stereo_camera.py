@@ -22,12 +22,11 @@ from segfloor_ros.core.camera.recording import (
     DEPTH,
     IMU_FRAME,
     MAX_LAG_S,
-    SENSORS,
     MeasurementLog,
     RawPair,
     RecordedSensor,
-    StereoCameraSettings,
 )
+from segfloor_ros.core.camera.settings import SENSORS, StereoCameraSettings
 from segfloor_ros.core.contracts import MAX_KEYFRAMES_UNDER_WAY, Measurement, WheelPose
 from segfloor_ros.core.errors import InputError, SegfloorError
 from segfloor_ros.core.geometry import Array, make_transform

@@ -11,7 +11,7 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA
 
 from segfloor_ros.apps.recordings import open_source
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.nodes.configuration import resolve
 from tools.endless_drive import write_endless_drive

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.simulation.world import RenderingError
 from segfloor_ros.apps.trajectory import read_trajectory
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.plugins.assembly import make_pipeline

@@ -10,7 +10,7 @@ from segfloor_ros.apps.simulation.scene_file import open_scene
 from segfloor_ros.apps.simulation.simulation import FrameTruth
 from segfloor_ros.apps.simulation.world import RenderingError
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.contracts import Mount
 from segfloor_ros.nodes.configuration import resolve
 from tools.floor_masks import (

@@ -35,7 +35,8 @@ from segfloor_ros.apps.lockstep import NO_MAPS, MapOptions, ProgressListener, no
 from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.results_folder import RunResult, summarise
 from segfloor_ros.apps.trajectory import Trajectory, corrected_trajectory
-from segfloor_ros.core.camera.recording import DEPTH, SENSORS
+from segfloor_ros.core.camera.recording import DEPTH
+from segfloor_ros.core.camera.settings import SENSORS
 from segfloor_ros.core.cloud import CloudLabelling
 from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.contracts import KeyframePath, LabelledPoints

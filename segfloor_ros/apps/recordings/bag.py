@@ -29,6 +29,7 @@ from segfloor_ros.core.camera.depth import depth_calibration, disparity_of_depth
 from segfloor_ros.core.camera.images import Grey, colour_image, depth_image, grey_image
 from segfloor_ros.core.camera.measurements import (
     imu_sample,
+    is_upright,
     measures_motion,
     rigid_motion,
     stamp_ns,
@@ -36,7 +37,8 @@ from segfloor_ros.core.camera.measurements import (
     xyz,
 )
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.camera.recording import RecordedSensor, StereoCameraSettings, is_upright
+from segfloor_ros.core.camera.recording import RecordedSensor
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.contracts import Measurement, WheelPose
 from segfloor_ros.core.errors import CalibrationError, InputError
 from segfloor_ros.core.files.whole import checked_ns

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from segfloor_ros.apps.recordings.files import SIDES, is_side, side_pairs
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.whole import MAX_BYTES, check_file
 from segfloor_ros.nodes.yaml_files import read_yaml

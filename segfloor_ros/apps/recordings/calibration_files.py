@@ -13,7 +13,7 @@ import yaml
 
 from segfloor_ros.apps.recordings.extrinsics import calibration_from_extrinsics
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.errors import CalibrationError
 from segfloor_ros.core.files.whole import number, read_lines
 from segfloor_ros.core.files.writing import MARK

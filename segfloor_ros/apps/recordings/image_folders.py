@@ -39,7 +39,8 @@ from segfloor_ros.apps.recordings.files import (
 from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.depth import depth_calibration, disparity_of_depth
-from segfloor_ros.core.camera.recording import DEPTH, RecordedSensor, StereoCameraSettings
+from segfloor_ros.core.camera.recording import DEPTH, RecordedSensor
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.images import read_depth
 from segfloor_ros.core.files.whole import END_NS, nanoseconds, whole_nanoseconds

@@ -41,7 +41,8 @@ from segfloor_ros.apps.recordings.image_folders import (
 from segfloor_ros.apps.recordings.source import DEFAULT_RATE_HZ, MaskFolder, PairEntry, StereoSource
 from segfloor_ros.core.camera.images import to_grey
 from segfloor_ros.core.camera.pixels import Grey
-from segfloor_ros.core.camera.recording import RecordedSensor, StereoCameraSettings
+from segfloor_ros.core.camera.recording import RecordedSensor
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.files.whole import check_file

@@ -59,3 +59,14 @@ def rigid_motion(translation: Any, rotation: Any, name: str) -> Array:
 def xyz(vector: Any) -> Array:
     """Return the components (3,) of a vector or point."""
     return np.array([vector.x, vector.y, vector.z])
+
+
+UPRIGHT = 0.8
+"""Cosine of the angle between gravity and the image's vertical up to which a camera is upright."""
+
+
+def is_upright(accel_m_s2: Array) -> bool:
+    """Whether up is about up in the image for what an IMU at rest feels (3,): its axes may be those
+    of the image.
+    """
+    return bool(-accel_m_s2[1] > UPRIGHT * np.linalg.norm(accel_m_s2))

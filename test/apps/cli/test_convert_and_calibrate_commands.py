@@ -18,7 +18,7 @@ from stereo_drive import room_drive, write_kitti
 import segfloor_ros
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.calibration_files import read_calibration
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 
 
 def test_a_converted_recording_has_the_same_frames(tmp_path):

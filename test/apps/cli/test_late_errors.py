@@ -24,7 +24,8 @@ from stereo_room import MOUNT
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.bag_writer import convert
 from segfloor_ros.apps.trajectory import read_trajectory
-from segfloor_ros.core.camera.recording import RecordedSensor, StereoCameraSettings
+from segfloor_ros.core.camera.recording import RecordedSensor
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.contracts import ImuSample, WheelPose
 from segfloor_ros.core.files.results import read_map_file
 from segfloor_ros.core.floor.segmentation import FloorSegmentation

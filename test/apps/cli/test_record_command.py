@@ -20,7 +20,7 @@ from stereo_drive import room_drive
 
 from segfloor_ros.apps.cli.topic_recorder import TopicRecord, stamp_of
 from segfloor_ros.apps.recordings import open_source
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.nodes.messages.camera_infos import camera_info_message
 from segfloor_ros.nodes.messages.images import image_message
 

@@ -30,8 +30,8 @@ from camera_recordings import (
 from segfloor_ros.apps.recordings import StereoSource, open_source
 from segfloor_ros.apps.recordings.calibration_files import write_ros_calibration
 from segfloor_ros.apps.recordings.files import partners
-from segfloor_ros.core.camera.recording import StereoCameraSettings
 from segfloor_ros.core.camera.rectification import StereoRectifier
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.errors import CalibrationError, InputError
 
 

@@ -21,7 +21,7 @@ from segfloor_ros.apps.recordings.bag_writer import (
     write_rosbag2_with,
 )
 from segfloor_ros.apps.recordings.ros_bag import Rosbag2Writer, use_rosbag2_py
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.contracts import ImuSample, WheelPose
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import make_transform

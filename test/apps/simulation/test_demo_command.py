@@ -15,7 +15,7 @@ from segfloor_ros.apps.cli.commands import simulate as simulate_command
 from segfloor_ros.apps.evaluation.maps import load_truth
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.simulation.world import RenderingError
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 
 app = typer.Typer()
 app.command('demo')(demo)

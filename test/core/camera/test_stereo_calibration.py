@@ -33,7 +33,7 @@ from segfloor_ros.apps.recordings.calibration_files import (
 )
 from segfloor_ros.apps.recordings.extrinsics import calibration_from_extrinsics
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.errors import CalibrationError
 from segfloor_ros.core.geometry import make_transform, transform_points
 

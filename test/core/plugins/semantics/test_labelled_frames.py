@@ -11,7 +11,7 @@ from small_network import constant_network, conv, grey_network, write_network
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.apps.recordings.opening import open_source
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.contracts import FLOOR, MOVING, NO_EVIDENCE, StereoFrame
 from segfloor_ros.core.plugins.semantics.network import ImageLabeller
 from segfloor_ros.core.timing import StageTimes
