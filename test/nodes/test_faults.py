@@ -21,6 +21,7 @@ from segfloor_ros.nodes.messages.diagnostics import Level
 from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.poses import path_arrays, pose_array
 from segfloor_ros.nodes.messages.topics import FLOOR, SLAM, TOPICS, to_ns
+from segfloor_ros.nodes.shared.stamp_order import AGREEING
 
 NEW_VIEW_RAD = 1.1 * NEW_TURN_RAD
 """Turn per frame: every one is a new view, which becomes a keyframe."""
@@ -64,6 +65,11 @@ class Drive:
             assert answer.level is Level.OK, answer
         if check:
             self.check_pose()
+
+    def jump(self) -> None:
+        """Send the pairs that show that the clock has jumped: all but the last are dropped."""
+        for answer in self.chain.drive([self.next() for _ in range(AGREEING - 1)]):
+            assert 'from the one before; dropped' in answer.message
 
     def check_pose(self) -> None:
         """The last pose must be the true one."""
@@ -203,6 +209,7 @@ def test_frames_twice_or_out_of_order_are_taken_once_and_in_order(drive) -> None
 def test_a_camera_that_was_unplugged_is_taken_up_again(drive, gap_s) -> None:
     """The same view returns after a pause, or after a jump of the clock."""
     drive.stamp_ns += gap_s * S
+    drive.jump()
     drive.go_on()
     stamps = path_arrays(drive.paths[-1]).stamp_ns
     assert stamps[0] < FRAME_NS * 10, 'the map was begun anew'
@@ -257,6 +264,7 @@ def test_a_slow_subscriber_holds_nobody_up(drive) -> None:
 def test_a_clock_that_goes_back_begins_a_new_map(drive) -> None:
     chain = drive.chain
     drive.stamp_ns = 1000 * FRAME_NS
+    drive.jump()
     frame = drive.next()
     (answer,) = chain.drive([frame])
     assert answer.level is Level.OK

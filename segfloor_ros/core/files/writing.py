@@ -241,6 +241,7 @@ def move_into_place(made: Path, target: Path) -> None:
     OSError, or InputError where a file of others is in the way; then nothing has changed.
     """
     new = {name: made / name for name in _files_in(made) if name != MARKER}
+    target.mkdir(exist_ok=True)
     _replace_files(target, new, is_all=True)
 
 
@@ -361,6 +362,8 @@ class _Journal:
     def remove(self, path: Path) -> None:
         """Note that it is gone."""
         with self._lock, suppress(OSError):
+            if self._process != os.getpid():  # a fork has nothing of its own yet
+                return
             if self._entries.pop(str(path.absolute()), None) is not None:
                 self._write()
             if not self._entries and self._file is not None:
@@ -379,7 +382,7 @@ class _Journal:
         number, self._name = tempfile.mkstemp('.json', dir=folder)
         self._file = os.fdopen(number, 'w')
         self._process, self._entries = os.getpid(), {}
-        fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(self._file, fcntl.LOCK_EX)
 
     def _write(self) -> None:
         if self._file is not None:

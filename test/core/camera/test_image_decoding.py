@@ -8,14 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from segfloor_ros.core.camera.images import (
-    CorruptImageError,
-    EightBitScale,
-    colour_image,
-    grey_image,
-    to_grey,
-)
-from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.camera.images import EightBitScale, colour_image, grey_image, to_grey
+from segfloor_ros.core.errors import CorruptImageError, InputError
 from segfloor_ros.core.files.images import decode_file
 
 RED, GREEN, BLUE = 200, 100, 50

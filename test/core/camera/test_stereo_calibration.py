@@ -309,7 +309,7 @@ def test_eyes_of_different_models_have_no_common_rectification() -> None:
         ('data: [50.0, ', 'data: [', 'left.yaml, camera_matrix: expected 9 numbers, found 8'),
         ('data: [50.0, ', 'data: [wide, ', 'left.yaml, camera_matrix: expected finite numbers'),
         ('data: [50.0, ', 'data: [0.0, ', r'left.yaml: K\[0\] = 0, so .* calibrate the pair'),
-        ('image_width: 64', '{', 'left.yaml, line 3: not valid YAML'),
+        ('image_width: 64', '{', 'left.yaml, line 4: not valid YAML'),
     ],
 )
 def test_faults_in_ros_files_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
