@@ -1,5 +1,5 @@
-"""Levenberg-Marquardt: a problem of two unknowns, and bundle adjustment and pose beside other
-solvers (SciPy, and gtsam where that is installed).
+"""Levenberg-Marquardt and Gauss-Newton: small problems, and bundle adjustment and pose compared
+with other solvers (SciPy, and gtsam where that is installed).
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import pytest
 from bundle_problems import CAMERA, disturbed, make_problem
 from scipy.optimize import least_squares
 
+from segfloor_ros.core.gauss_newton import gauss_newton
 from segfloor_ros.core.geometry import invert, transform_points
 from segfloor_ros.core.least_squares import SHRINK, minimise
 from segfloor_ros.core.slam.mapping.bundle_adjustment import adjust
@@ -176,3 +177,44 @@ def test_a_pose_is_that_of_another_solver(oracle) -> None:
     problem = replace(truth, T_camera_world=start[None], observations=seen)
     poses, _ = oracle(problem, are_points_free=False)
     assert np.abs(se3_log(found.T_camera_world @ invert(poses[0]))).max() < 1e-5
+
+
+def curve(count=60, seed=0):
+    """Return times and values of an exponential fall with noise and outliers."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0.0, 3.0, count)
+    y = 2.0 * np.exp(-0.7 * t) + 0.02 * rng.normal(size=count)
+    y[::9] += 1.0
+    return t, y
+
+
+def test_a_robust_fit_by_a_schedule_is_that_of_another_solver() -> None:
+    t, y = curve()
+    scale = 0.05
+
+    def linearise(x: np.ndarray, stage_scale: float) -> tuple[np.ndarray, np.ndarray, float]:
+        J = np.stack([np.exp(-x[1] * t), -x[0] * t * np.exp(-x[1] * t)], axis=1)
+        error = y - x[0] * np.exp(-x[1] * t)
+        weighted = J.T / (1 + (error / stage_scale) ** 2)
+        return weighted @ J, weighted @ error, stage_scale
+
+    found, information, last = gauss_newton(
+        np.array([1.5, 0.5]), linearise, (1.0, 0.3, *[scale] * 20), np.add
+    )
+    expected = least_squares(
+        lambda x: y - x[0] * np.exp(-x[1] * t), (2.0, 0.7), loss='cauchy', f_scale=scale, xtol=1e-12
+    )
+    np.testing.assert_allclose(found, expected.x, atol=1e-5)
+    np.testing.assert_allclose(found, (2.0, 0.7), atol=0.02)
+    assert information.shape == (2, 2)
+    assert last == scale
+
+
+def test_unknowns_that_are_not_free_stay_and_a_singular_step_is_the_shortest() -> None:
+    def linearise(x: np.ndarray, _: int) -> tuple[np.ndarray, np.ndarray, None]:
+        J = np.ones((1, 3))
+        return J.T @ J, J.T @ (6.0 - J @ x), None
+
+    free = np.array([True, False, True])
+    found, *_ = gauss_newton(np.zeros(3), linearise, range(2), np.add, free)
+    np.testing.assert_allclose(found, (3.0, 0.0, 3.0), atol=1e-12)

@@ -19,13 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import Up
-from segfloor_ros.core.geometry import (
-    Array,
-    invert,
-    make_transform,
-    transform_points,
-    without_drift,
-)
+from segfloor_ros.core.geometry import Array, invert, make_transform, transform_points
 from segfloor_ros.core.least_squares import SMALLEST, minimise
 from segfloor_ros.core.slam.mapping.normal_equations import (
     Factors,
@@ -49,7 +43,7 @@ from segfloor_ros.core.slam.rig import (
 )
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, LoopEdge, SparseMap
 from segfloor_ros.core.slam.thresholds import ENOUGH, NEARLY_ALL, POINTS_PER_KEYFRAME
-from segfloor_ros.core.twists import se3_exp
+from segfloor_ros.core.twists import se3_exp, without_drift
 
 CONVERGED = 2e-3
 """Stop at this relative decrease of the cost; the next keyframe goes on from there."""
