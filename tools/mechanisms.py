@@ -135,7 +135,7 @@ SLAM: dict[str, Mechanism] = {
 
 FLOOR: dict[str, Mechanism] = {
     NOTHING: Mechanism(),
-    'a bend needs a measurement': Mechanism({'core.floor.disparity.profile._LINE_ITERATIONS': -1}),
+    'a bend needs a measurement': Mechanism({'core.floor.disparity.profile._LEAST_SUPPORT': 0.0}),
     'level expectation': Mechanism(
         {
             'core.floor.segmentation.expectations': lambda mount, _: np.array(

@@ -263,7 +263,7 @@ def calibrate_folder(
 
 
 @dataclass(frozen=True)
-class CalibrationCheck:
+class RecordingCheck:
     """How a calibration fits a recording. pairs: of it. rows_px: by how much the same points stand
     in other rows, the median and the most along it. scale: lengths on a board as measured, as
     multiples of the true ones, the median of `boards` pairs that show it. None: not seen. faults:
@@ -281,7 +281,7 @@ def check_recording(
     source: StereoSource,
     board: Board | None = None,
     on_progress: Callable[[int], None] = lambda done: None,
-) -> CalibrationCheck:
+) -> RecordingCheck:
     """Measure how the calibration of a recording fits it: by the check of the rig, and where a
     board is in view by its corners, which look alike to the former. Raises InputError.
     """
@@ -311,7 +311,7 @@ def check_recording(
         scale = float(np.median(scales))
         faults += _faults_on_boards(float(np.median(board_rows_px)), scale)
     rows = (float(np.median(rows_px)), max(rows_px)) if rows_px else None
-    return CalibrationCheck(pairs, rows, scale, len(on_boards), faults)
+    return RecordingCheck(pairs, rows, scale, len(on_boards), faults)
 
 
 def _faults_on_boards(rows_px: float, scale: float) -> Iterator[InputFault]:

@@ -44,16 +44,6 @@ def invert(T_a_b: Array) -> Array:
     return T_b_a
 
 
-def without_drift(T: Array) -> Array:
-    """Return products of poses (..., 4, 4) with the nearest rotations: `invert` transposes, so the
-    rounding errors of repeated products would grow threefold each time.
-    """
-    result = T.copy()
-    U, _, V = np.linalg.svd(T[..., :3, :3])
-    result[..., :3, :3] = U @ V
-    return result
-
-
 def transform_points(T_a_b: Array, points_b: NDArray[np.floating]) -> Array:
     """Map points (N, 3) of frame b into frame a."""
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
@@ -89,12 +79,6 @@ def planar(T: Array) -> NDArray[np.float64]:
 def rotation_angle(R: Array) -> Any:
     """Return the angles (...) of rotations (..., 3, 3) in radians, in [0, pi]."""
     return np.arccos(np.clip((np.trace(R, axis1=-2, axis2=-1) - 1) / 2, -1.0, 1.0))
-
-
-def is_within(motion: Array, reach: tuple[float, float]) -> bool:
-    """Whether a motion (4, 4) is at most as far as a reach in metres and a turn in radians."""
-    moved_m = float(np.linalg.norm(motion[:3, 3]))
-    return moved_m <= reach[0] and rotation_angle(motion[:3, :3]) <= reach[1]
 
 
 def quaternions_of(rotations: Array) -> Array:

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from segfloor_ros.core.geometry import Array, make_transform, quaternions_of
+from segfloor_ros.core.geometry import Array, make_transform, quaternions_of, rotation_angle
 
 
 def skew(v: Array) -> Array:
@@ -119,3 +119,19 @@ def between(T_a: Array, T_b: Array, share: float) -> Array:
     turn = rotation_vectors((T_a[:3, :3].T @ T_b[:3, :3])[None])[0]
     rotation = T_a[:3, :3] @ rotations_by(share * turn[None])[0]
     return make_transform(rotation, (1 - share) * T_a[:3, 3] + share * T_b[:3, 3])
+
+
+def without_drift(T: Array) -> Array:
+    """Return products of poses (..., 4, 4) with the nearest rotations: `invert` transposes, so the
+    rounding errors of repeated products would grow threefold each time.
+    """
+    result = T.copy()
+    U, _, V = np.linalg.svd(T[..., :3, :3])
+    result[..., :3, :3] = U @ V
+    return result
+
+
+def is_within(motion: Array, reach: tuple[float, float]) -> bool:
+    """Whether a motion (4, 4) is at most as far as a reach in metres and a turn in radians."""
+    moved_m = float(np.linalg.norm(motion[:3, 3]))
+    return moved_m <= reach[0] and rotation_angle(motion[:3, :3]) <= reach[1]

@@ -26,6 +26,7 @@ from segfloor_ros.core.floor.disparity.matching import (
     RUN_UP_ROWS,
     SAME_PX,
 )
+from segfloor_ros.core.gauss_newton import gauss_newton
 from segfloor_ros.core.geometry import Array
 
 SEGMENTS = 5
@@ -37,16 +38,14 @@ _SCALE_PX = 0.6
 """Scale of the M-estimator."""
 _STIFFNESS = 0.02
 """How strongly the spline resists bending."""
-_SCHEDULE = (
-    ((1.5, 1e4), (1.0, 1e4))  # a line, near the plane that is known
-    + 2 * ((1.5, 1.0),)  # a spline, which grows along the floor where that bends
-    + 4 * ((1.0, 1.0),)
-)
-"""Scale of the estimator and stiffness of the spline, relative to the settings, by iteration."""
-_LINE_ITERATIONS = 2
+_LINE = ((1.5, 1e4), (1.0, 1e4))
+_SPLINE = 2 * ((1.5, 1.0),) + 4 * ((1.0, 1.0),)
+"""Scale of the estimator and stiffness of the spline, relative to the settings, by iteration: a
+line, near the plane that is known, then a spline, which grows along the floor where that bends."""
 _CORRELATED_PIXELS = 200.0
-"""Neighbouring disparities err together: so many of them count as one measurement. What
-is less says nothing about how a floor bends."""
+"""Neighbouring disparities err together: so many of them count as one measurement."""
+_LEAST_SUPPORT = 1 / NOISE_PX**2
+"""Less than one measurement says nothing about how a floor bends."""
 
 _WIDE_PX = 480
 """Of wider images every other column is used: neighbours say the same."""
@@ -181,20 +180,20 @@ def fit_profile(v_disparity: VDisparity, line: FloorLine, camera: StereoCamera) 
     abscissae = start + (np.arange(_CONTROLS) - 1) / to_position
     prior = line.slope * (abscissae - line.horizon)
     information = _prior_information(prior, line, camera)
-    controls = prior.copy()
     bend = np.diff(np.eye(_CONTROLS), n=2, axis=0)
-    scale = _SCALE_PX
-    support = 0.0
-    for iteration, (factor, stiffness) in enumerate(_SCHEDULE):
-        if iteration == _LINE_ITERATIONS and support * NOISE_PX**2 < 1:
-            break
-        residual = disparity - basis @ controls
-        ratio = np.clip(residual / (3 * factor * scale), -1, 1)
+
+    def linearise(controls: Array, stage: tuple[float, float]) -> tuple[Array, Array, float]:
+        factor, stiffness = stage
+        ratio = np.clip((disparity - basis @ controls) / (3 * factor * _SCALE_PX), -1, 1)
         robust = weight * (1 - ratio**2) ** 2
-        normal = basis.T @ (basis * robust[:, None]) + information
-        normal += _STIFFNESS * stiffness * bend.T @ bend
-        controls = prior + np.linalg.solve(normal, basis.T @ (robust * (disparity - basis @ prior)))
-        support = float(robust.sum())
+        known = information + _STIFFNESS * stiffness * bend.T @ bend
+        weighted = basis.T * robust
+        gradient = weighted @ (disparity - basis @ controls) + known @ (prior - controls)
+        return weighted @ basis + known, gradient, float(robust.sum())
+
+    controls, _, support = gauss_newton(prior, linearise, _LINE, np.add)
+    if support >= _LEAST_SUPPORT:
+        controls, _, support = gauss_newton(controls, linearise, _SPLINE, np.add)
     controls = np.maximum.accumulate(controls)
     grid = np.arange(np.ceil(start), first_row + height)
     values = spline_basis((grid - start) * to_position) @ controls

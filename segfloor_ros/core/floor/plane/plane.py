@@ -27,6 +27,7 @@ from segfloor_ros.core.floor.disparity.profile import (
     pixels_where,
     rising,
 )
+from segfloor_ros.core.gauss_newton import gauss_newton
 from segfloor_ros.core.geometry import Array
 
 MAX_PITCH_RAD, MAX_ROLL_RAD = np.radians([45.0, 20.0])
@@ -321,22 +322,19 @@ def refine(
     metres, along which the floor runs. mean, sigma: (3,) what is expected, and how surely.
     scales_px: of the biweight, one per iteration.
     """
-    state = start.copy()
     samples = replace(samples, rays=np.asfortranarray(samples.rays))
     free = np.isnan(known)
-    information: Array = np.eye(3)
-    shared: Array = np.zeros(3)
     prior = np.diag(sigma**-2.0)
-    for scale in scales_px:
+
+    def linearise(state: Array, scale: float) -> tuple[Array, Array, Array]:
         information, gradient, shared = _normal_equations(samples, state, scale)
         _add_travel(information, gradient, state, travel)
-        information += prior
-        gradient += prior @ (mean - state)
-        step = np.zeros(3)
-        step[free] = np.linalg.solve(
-            information[np.ix_(free, free)] + 1e-9 * np.eye(int(free.sum())), gradient[free]
-        )
-        state = state + np.clip(step, -0.1, 0.1)
+        return information + prior, gradient + prior @ (mean - state), shared
+
+    def moved(state: Array, step: Array) -> Array:
+        return state + np.clip(step, -0.1, 0.1)
+
+    state, information, shared = gauss_newton(start, linearise, scales_px, moved, free)
     error = np.zeros(3)
     covariance = np.linalg.pinv(information[np.ix_(free, free)])
     by_offset = OFFSET_SIGMA_PX * (covariance @ shared[free])

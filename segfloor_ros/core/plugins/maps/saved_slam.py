@@ -22,9 +22,10 @@ from segfloor_ros.core.contracts import (
 )
 from segfloor_ros.core.errors import CalibrationError, InputError, MapError
 from segfloor_ros.core.files.arrays import Arrays, MapFile
-from segfloor_ros.core.geometry import invert, transform_points, without_drift
+from segfloor_ros.core.geometry import invert, transform_points
 from segfloor_ros.core.plugins.sensors.gyroscope import MOMENT_NS
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
+from segfloor_ros.core.twists import without_drift
 
 PART = 'slam'
 BEFORE_ALL_NS = -MOMENT_NS

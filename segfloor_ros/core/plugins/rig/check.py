@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera, is_disparity
 from segfloor_ros.core.contracts import InputFault, StereoFrame
+from segfloor_ros.core.gauss_newton import gauss_newton
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.plugins.rig.estimates import (
-    LEAST_NOISE_PX,
     MAX_HAMMING,
     MIN_MATCHES,
     MIN_TURN_RAD,
@@ -35,6 +35,7 @@ from segfloor_ros.core.plugins.rig.estimates import (
     DepthCheck,
     Matches,
     follow,
+    spread_px,
 )
 from segfloor_ros.core.timing import timed
 
@@ -402,15 +403,15 @@ def _fit(A: Array, measured: Array) -> tuple[Array, Array, float]:
     """Return what fits A (N, K) to what was measured (N,) without outliers, its covariance (K, K)
     for a noise of 1, and the noise.
     """
-    weight, noise = np.ones(len(A)), LEAST_NOISE_PX
-    for _ in range(10):
-        W = A * weight[:, None]
-        covariance = np.linalg.pinv(W.T @ A)
-        x = covariance @ W.T @ measured
+
+    def linearise(x: Array, _: int) -> tuple[Array, Array, None]:
         error = measured - A @ x
-        noise = max(1.4826 * float(np.median(np.abs(error))), LEAST_NOISE_PX)
-        weight = 1.0 / (1.0 + (error / (2 * noise)) ** 2)
-    return x, covariance, noise
+        weighted = A.T / (1.0 + (error / (2 * spread_px(error))) ** 2)
+        return weighted @ A, weighted @ error, None
+
+    plain = np.linalg.lstsq(A, measured, rcond=None)[0]
+    x, information, _ = gauss_newton(plain, linearise, range(9), np.add)
+    return x, np.linalg.pinv(information), spread_px(measured - A @ x)
 
 
 def _contrast(

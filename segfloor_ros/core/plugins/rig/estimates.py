@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import MAX_OFFSET_PX, StereoCamera
+from segfloor_ros.core.gauss_newton import gauss_newton
 from segfloor_ros.core.geometry import Array, transform_points
 from segfloor_ros.core.twists import se3_exp, skew
 
@@ -319,25 +320,35 @@ def _fit_motion(camera: StereoCamera, then: Array, now: Array) -> tuple[Array, A
     """
     then, now = then.astype(np.float64), now.astype(np.float64)
     # All is in front of the camera.
-    x, T = np.array([0.0, min(0.0, float(then[:, 2].min()) - ROWS_PX)]), np.eye(4)
-    information, noise_px = np.zeros((2, 2)), LEAST_NOISE_PX
-    for step in range(STEPS):
+    x = np.array([0.0, min(0.0, float(then[:, 2].min()) - ROWS_PX)])
+    state: tuple[Array, Array] = np.eye(4), x
+    known = np.diag([0.0] * 6 + [PRIOR_SIGMA**-2, WINDOW_PX**-2])
+
+    def linearise(state: tuple[Array, Array], _: int) -> tuple[Array, Array, float]:
+        T, x = state
         error, J = _residuals(camera, then, now, x, T)
-        noise_px = max(1.4826 * float(np.median(np.abs(error))), LEAST_NOISE_PX)
+        noise_px = spread_px(error)
         weight = (1.0 + np.square(error).sum(axis=1) / (2 * noise_px) ** 2) ** -2 / noise_px**2
-        H = np.einsum('nij,nik,n->jk', J, J, weight)
-        g = np.einsum('nij,ni,n->j', J, error, weight)
-        H[6, 6] += PRIOR_SIGMA**-2
-        g[6] -= x[0] * PRIOR_SIGMA**-2
-        H[7, 7] += WINDOW_PX**-2
-        g[7] -= x[1] * WINDOW_PX**-2
-        size = 6 if step < MOTION_STEPS else 8
-        change = np.zeros(8)
-        change[:size] = np.linalg.lstsq(H[:size, :size], g[:size], rcond=None)[0]
-        T = se3_exp(change[:6]) @ T
-        x = x + np.clip(change[6:], (-PRIOR_SIGMA, -WINDOW_PX), (PRIOR_SIGMA, WINDOW_PX))
-        information = H[6:, 6:] - H[6:, :6] @ np.linalg.pinv(H[:6, :6]) @ H[:6, 6:]
+        weighted = J.reshape(-1, 8).T * np.repeat(weight, 3)
+        gradient = weighted @ error.ravel() - known @ np.append(np.zeros(6), x)
+        return weighted @ J.reshape(-1, 8) + known, gradient, noise_px
+
+    def moved(state: tuple[Array, Array], step: Array) -> tuple[Array, Array]:
+        T, x = state
+        most = np.array([PRIOR_SIGMA, WINDOW_PX])
+        return se3_exp(step[:6]) @ T, x + np.clip(step[6:], -most, most)
+
+    state, *_ = gauss_newton(state, linearise, range(MOTION_STEPS), moved, slice(6))
+    (T, x), H, noise_px = gauss_newton(state, linearise, range(STEPS - MOTION_STEPS), moved)
+    information = H[6:, 6:] - H[6:, :6] @ np.linalg.pinv(H[:6, :6]) @ H[:6, 6:]
     return T, x, np.linalg.inv(information), noise_px
+
+
+def spread_px(error_px: Array) -> float:
+    """Return the standard deviation of errors (...) of which less than half are outliers, by their
+    median, at least `LEAST_NOISE_PX`.
+    """
+    return max(1.4826 * float(np.median(np.abs(error_px))), LEAST_NOISE_PX)
 
 
 def _turn_rad(T_now_then: Array) -> float:

@@ -9,13 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from segfloor_ros.core.contracts import Measurement, RelativeMotion, Up, WheelPose
-from segfloor_ros.core.geometry import (
-    Array,
-    invert,
-    is_within,
-    make_transform,
-    rotation_from_angles,
-)
+from segfloor_ros.core.geometry import Array, invert, make_transform, rotation_from_angles
 from segfloor_ros.core.plugins.sensors.gyroscope import MOMENT_NS, Gyroscope
 from segfloor_ros.core.plugins.sensors.inertial_odometry import Gravity, InertialOdometry
 from segfloor_ros.core.plugins.sensors.wheel_odometry import (
@@ -30,7 +24,7 @@ from segfloor_ros.core.plugins.sensors.wheel_odometry import (
     yaw_of,
 )
 from segfloor_ros.core.slam.thresholds import ENOUGH, SPEED_SIGMA
-from segfloor_ros.core.twists import adjoint
+from segfloor_ros.core.twists import adjoint, is_within
 
 SIGMA_TURN_SHARE = 0.03
 """Error of a turn measured by wheels, as a share of it."""

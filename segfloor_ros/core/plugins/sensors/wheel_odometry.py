@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from segfloor_ros.core.contracts import WheelPose
+from segfloor_ros.core.gauss_newton import gauss_newton
 from segfloor_ros.core.geometry import Array, invert, make_transform, rotation_from_angles
 from segfloor_ros.core.plugins.sensors.gyroscope import (
     LATE_NS,
@@ -276,15 +277,16 @@ def _robust(rows: Array, measured: Array, prior: Array, sigma: Array) -> tuple[A
     """Solve weighted least squares with a prior, outliers weighed down; returns solution and
     standard deviations.
     """
-    solution = prior
-    information = np.diag(sigma**-2)
-    for _ in range(ROUNDS):
-        chi2 = (measured - rows @ solution) ** 2
-        weight = 1 / (1 + chi2 / chi2_limit(1, GATE)) ** 2
-        weighted = rows * weight[:, None]
-        H = information + weighted.T @ rows
-        solution = np.linalg.solve(H, information @ prior + weighted.T @ measured)
-    return solution, np.sqrt(np.diag(np.linalg.inv(H)))
+    known = np.diag(sigma**-2)
+
+    def linearise(solution: Array, _: int) -> tuple[Array, Array, None]:
+        error = measured - rows @ solution
+        weight = 1 / (1 + error**2 / chi2_limit(1, GATE)) ** 2
+        weighted = rows.T * weight
+        return known + weighted @ rows, known @ (prior - solution) + weighted @ error, None
+
+    solution, information, _ = gauss_newton(prior, linearise, range(ROUNDS), np.add)
+    return solution, np.sqrt(np.diag(np.linalg.inv(information)))
 
 
 def wheels_m(T_before_now: Array) -> float:

@@ -1,6 +1,6 @@
 """Local bundle adjustment: keyframes and points move together until the features fit best.
 
-Levenberg-Marquardt, Huber cost. One pose per stereo pair: the baseline is fixed.
+Huber cost, minimised by Levenberg-Marquardt. One pose per stereo pair: the baseline is fixed.
 
 Bundle adjustment of the whole map, after a loop was closed.
 
@@ -19,18 +19,11 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import Up
-from segfloor_ros.core.geometry import (
-    Array,
-    invert,
-    make_transform,
-    transform_points,
-    without_drift,
-)
+from segfloor_ros.core.geometry import Array, invert, make_transform, transform_points
+from segfloor_ros.core.least_squares import SMALLEST, minimise
 from segfloor_ros.core.slam.mapping.normal_equations import (
     Factors,
     Linearisation,
-    Step,
-    System,
     cost,
     factors_of,
     loop_factors,
@@ -50,7 +43,7 @@ from segfloor_ros.core.slam.rig import (
 )
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, LoopEdge, SparseMap
 from segfloor_ros.core.slam.thresholds import ENOUGH, NEARLY_ALL, POINTS_PER_KEYFRAME
-from segfloor_ros.core.twists import se3_exp
+from segfloor_ros.core.twists import se3_exp, without_drift
 
 CONVERGED = 2e-3
 """Stop at this relative decrease of the cost; the next keyframe goes on from there."""
@@ -104,112 +97,95 @@ def adjust(
     leads through a camera that sees it waits: one that is far away would spoil the step of all. It
     ends early when the result is no longer wanted.
     """
-    prior, order = problem.offset, np.argsort(problem.keyframe, kind='stable')
-    problem = _take_observations(problem, order)
-    state = _evaluate(camera, problem, prior)
-    cost_before = state.cost
-    damping, growth = 1e-4, 2.0
-    for _ in range(iterations):
-        if not is_wanted():
-            break
-        system = _linearise(camera, problem, state, prior)
-        step = system.solve(damping)
-        candidate = _apply(problem, step)
-        trial = _evaluate(camera, candidate, prior)
-        through = problem.point[state.front & ~trial.front]
-        if len(through):
-            candidate.points_world[through] = problem.points_world[through]
-            trial = _evaluate(camera, candidate, prior)
-        predicted = system.predicted_decrease(step, damping)
-        gain = (state.cost - trial.cost) / max(predicted, 1e-12)
-        if gain > 0:
-            converged = state.cost - trial.cost < CONVERGED * state.cost
-            problem, state = candidate, trial
-            damping *= max(1 / 3, 1 - (2 * gain - 1) ** 3)
-            growth = 2.0
-            if converged:
-                break
-        else:
-            damping *= growth
-            growth *= 2.0
-    inliers = np.empty(len(order), bool)
-    inliers[order] = state.front & (state.chi2 <= problem.observations.chi2_limit)
-    return BundleResult(
-        problem.T_camera_world,
-        problem.points_world,
-        inliers,
-        cost_before,
-        state.cost,
-        problem.offset,
+    order = np.argsort(problem.keyframe, kind='stable')
+    in_order = replace(
+        problem,
+        keyframe=problem.keyframe[order],
+        point=problem.point[order],
+        observations=problem.observations.take(order),
     )
+    start = _State.at(camera, in_order, problem.offset)
+    end = minimise(start, iterations, CONVERGED, is_wanted=is_wanted)
+    adjusted = end.problem
+    inliers = np.empty(len(order), bool)
+    inliers[order] = end.front & (end.chi2 <= adjusted.observations.chi2_limit)
+    poses, points = adjusted.T_camera_world, adjusted.points_world
+    return BundleResult(poses, points, inliers, start.cost, end.cost, adjusted.offset)
 
 
 @dataclass(frozen=True)
 class _State:
+    """A problem on trial, with its residuals and cost. Observations are in the order of their
+    keyframes. prior: what was known of the offset at the start.
+    """
+
+    camera: StereoCamera
+    problem: BundleProblem
+    prior: OffsetEstimate
     points_camera: Array
     residual: Array
     chi2: Array
     front: NDArray[np.bool_]
     cost: float
 
+    @staticmethod
+    def at(camera: StereoCamera, problem: BundleProblem, prior: OffsetEstimate) -> _State:
+        """Evaluate a problem."""
+        points = problem.points_world[problem.point]
+        starts = np.searchsorted(problem.keyframe, np.arange(len(problem.T_camera_world) + 1))
+        for k, T in enumerate(problem.T_camera_world):
+            mine = slice(starts[k], starts[k + 1])
+            points[mine] = transform_points(T, points[mine])
+        front = points[:, 2] > MIN_DEPTH_M
+        points[:, 2] = np.maximum(points[:, 2], MIN_DEPTH_M)
+        residual = residuals(camera, points, problem.observations)
+        residual[:, 2] += problem.offset.value_px * problem.observations.has_disparity
+        chi2 = squared_norms(residual, problem.observations.information)
+        total = huber_cost(chi2, problem.observations.chi2_limit)
+        total += prior.information * (problem.offset.value_px - prior.value_px) ** 2
+        total += sum(cost(factors, problem.T_camera_world) for factors in problem.factors)
+        return _State(camera, problem, prior, points, residual, chi2, front, total)
 
-def _take_observations(problem: BundleProblem, rows: NDArray[np.intp]) -> BundleProblem:
-    return replace(
-        problem,
-        keyframe=problem.keyframe[rows],
-        point=problem.point[rows],
-        observations=problem.observations.take(rows),
-    )
+    def linearised(self) -> Callable[[float], tuple[_State, float]]:
+        """Return what solves the normal equations for a damping."""
+        problem, observations = self.problem, self.problem.observations
+        weight = huber_weights(self.chi2, observations.chi2_limit)
+        at = Linearisation(
+            problem.T_camera_world,
+            problem.num_free,
+            len(problem.points_world),
+            problem.keyframe,
+            problem.point,
+            self.points_camera,
+            self.residual,
+            observations.information * weight[:, None] * self.front[:, None],
+        )
+        system = normal_equations(self.camera, at).with_prior(
+            self.prior.information, problem.offset.value_px - self.prior.value_px
+        )
+        system = with_factors(system, problem.T_camera_world, problem.factors)
 
+        def stepped(damping: float) -> tuple[_State, float]:
+            step = system.solve(damping)
+            poses = problem.T_camera_world.copy()
+            poses[: problem.num_free] = se3_exp(step.twists) @ poses[: problem.num_free]
+            offset_px = problem.offset.value_px + step.offset_px
+            candidate = replace(
+                problem,
+                T_camera_world=poses,
+                points_world=problem.points_world + step.shifts,
+                offset=OffsetEstimate(offset_px, step.offset_information),
+            )
+            trial = _State.at(self.camera, candidate, self.prior)
+            through = problem.point[self.front & ~trial.front]
+            if len(through):
+                candidate.points_world[through] = problem.points_world[through]
+                trial = _State.at(self.camera, candidate, self.prior)
+            predicted = system.predicted_decrease(step, damping)
+            gain = (self.cost - trial.cost) / max(predicted, SMALLEST)
+            return trial, max(1 / 3, 1 - (2 * gain - 1) ** 3)
 
-def _evaluate(camera: StereoCamera, problem: BundleProblem, prior: OffsetEstimate) -> _State:
-    """Return residuals and cost; observations are in the order of their keyframes."""
-    points = problem.points_world[problem.point]
-    starts = np.searchsorted(problem.keyframe, np.arange(len(problem.T_camera_world) + 1))
-    for k, T in enumerate(problem.T_camera_world):
-        mine = slice(starts[k], starts[k + 1])
-        points[mine] = transform_points(T, points[mine])
-    front = points[:, 2] > MIN_DEPTH_M
-    points[:, 2] = np.maximum(points[:, 2], MIN_DEPTH_M)
-    residual = residuals(camera, points, problem.observations)
-    residual[:, 2] += problem.offset.value_px * problem.observations.has_disparity
-    chi2 = squared_norms(residual, problem.observations.information)
-    total = huber_cost(chi2, problem.observations.chi2_limit)
-    total += prior.information * (problem.offset.value_px - prior.value_px) ** 2
-    total += sum(cost(factors, problem.T_camera_world) for factors in problem.factors)
-    return _State(points, residual, chi2, front, total)
-
-
-def _linearise(
-    camera: StereoCamera, problem: BundleProblem, state: _State, prior: OffsetEstimate
-) -> System:
-    observations = problem.observations
-    weight = observations.information * huber_weights(state.chi2, observations.chi2_limit)[:, None]
-    at = Linearisation(
-        problem.T_camera_world,
-        problem.num_free,
-        len(problem.points_world),
-        problem.keyframe,
-        problem.point,
-        state.points_camera,
-        state.residual,
-        weight * state.front[:, None],
-    )
-    system = normal_equations(camera, at).with_prior(
-        prior.information, problem.offset.value_px - prior.value_px
-    )
-    return with_factors(system, problem.T_camera_world, problem.factors)
-
-
-def _apply(problem: BundleProblem, step: Step) -> BundleProblem:
-    poses = problem.T_camera_world.copy()
-    poses[: problem.num_free] = se3_exp(step.twists) @ poses[: problem.num_free]
-    return replace(
-        problem,
-        T_camera_world=poses,
-        points_world=problem.points_world + step.shifts,
-        offset=OffsetEstimate(problem.offset.value_px + step.offset_px, step.offset_information),
-    )
+        return stepped
 
 
 UNMOVED_M = 1e-6

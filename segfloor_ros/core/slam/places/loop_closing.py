@@ -10,6 +10,7 @@ using Dynamic Covariance Scaling, ICRA 2013).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from scipy import sparse
 
 from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.geometry import Array, invert
+from segfloor_ros.core.least_squares import minimise
 from segfloor_ros.core.slam.mapping.bundle_adjustment import move_keyframes
 from segfloor_ros.core.slam.mapping.keyframe_mapping import fuse_duplicates
 from segfloor_ros.core.slam.mapping.normal_equations import solve_symmetric
@@ -26,7 +28,7 @@ from segfloor_ros.core.slam.sparse_map import LINK_SIGMA, LoopEdge, Match, Spars
 from segfloor_ros.core.slam.tracking.pose import CONVERGED
 from segfloor_ros.core.twists import adjoint, se3_exp, se3_log, se3_logs
 
-STEPS = 20
+STEPS, FIRST_DAMPING = 20, 1e-6
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ def apply_closing(sparse_map: SparseMap, closing: Closing, result: tuple[Array, 
     """
     poses, weight = result
     graph, least = closing.graph, _robust_share(chi2_limit(6)) ** 2
-    so_far, _ = _robust(graph, _errors(graph, graph.T_camera_world), graph.T_camera_world)
+    so_far = _State.at(graph, graph.T_camera_world).weight
     if ((weight < least) & (so_far >= least)).any():
         return False
     move_keyframes(sparse_map, poses)
@@ -147,67 +149,57 @@ def optimise(graph: PoseGraph) -> tuple[Array, Array]:
     """Return the poses T_camera_world (K, 4, 4) that fit best, and the weights (M,) that the edges
     have there, in [0, 1].
     """
-    poses = graph.T_camera_world
-    error = _errors(graph, poses)
-    weight, cost = _robust(graph, error, poses)
-    damping = 1e-6
-    for _ in range(STEPS):
-        step = _solve(graph, poses, error, weight, damping)
-        candidate = se3_exp(step) @ poses
-        trial = _errors(graph, candidate)
-        trial_weight, trial_cost = _robust(graph, trial, candidate)
-        if not trial_cost <= cost:  # nor where it is no number
-            damping *= 10.0
-            continue
-        converged = cost - trial_cost < CONVERGED * cost + 1e-12
-        poses, error, weight, cost = candidate, trial, trial_weight, trial_cost
-        damping = max(damping * 0.1, 1e-9)
-        if converged:
-            break
-    return poses, weight
+    best = minimise(_State.at(graph, graph.T_camera_world), STEPS, CONVERGED, FIRST_DAMPING)
+    return best.poses, best.weight
 
 
-def _errors(graph: PoseGraph, poses: Array) -> Array:
-    """Return the errors (M, 6) of the edges in units of their sigma."""
-    T_i_j = poses[graph.i] @ invert(poses[graph.j])
-    return se3_logs(T_i_j @ invert(graph.T_i_j)) / graph.sigma
+@dataclass(frozen=True)
+class _State:
+    """Poses on trial, (K, 4, 4), with errors (M, 6) in units of sigma, weights (M,) and cost of the
+    edges.
+    """
 
+    graph: PoseGraph
+    poses: Array
+    error: Array
+    weight: Array
+    cost: float
 
-def _robust(graph: PoseGraph, error: Array, poses: Array) -> tuple[Array, float]:
-    """Return the weights (M,) of the edges and the cost (Geman-McClure for the robust ones)."""
-    chi2 = (error**2).sum(axis=1)
-    share = _robust_share(chi2)
-    weight = np.where(graph.is_robust, share**2, 1.0)
-    cost = float(np.where(graph.is_robust, share * chi2, chi2).sum())
-    return weight, cost
+    @staticmethod
+    def at(graph: PoseGraph, poses: Array) -> _State:
+        """Evaluate the edges; Geman-McClure cost for the robust ones."""
+        T_i_j = poses[graph.i] @ invert(poses[graph.j])
+        error = se3_logs(T_i_j @ invert(graph.T_i_j)) / graph.sigma
+        chi2 = (error**2).sum(axis=1)
+        share = np.where(graph.is_robust, _robust_share(chi2), 1.0)
+        return _State(graph, poses, error, share**2, float((share * chi2).sum()))
+
+    def linearised(self) -> Callable[[float], tuple[_State, float]]:
+        """Return what solves the normal equations for a damping. A small error's derivative is that
+        of the twists themselves: e changes by xi_i - Ad(T_i_j) xi_j.
+        """
+        graph, poses, count = self.graph, self.poses, len(self.poses)
+        scale = (np.sqrt(self.weight)[:, None] / graph.sigma)[:, :, None]
+        J_j = -scale * adjoint(poses[graph.i] @ invert(poses[graph.j]))
+        blocks = np.stack([scale * np.eye(6), J_j], axis=1).reshape(-1, 6, 6)
+        columns = np.stack([graph.i, graph.j], axis=1).ravel()
+        rows = 2 * np.arange(len(graph.i) + 1)
+        shape = (6 * len(graph.i), 6 * count)
+        J = sparse.bsr_array((blocks, columns, rows), shape=shape).tocsr()
+        moving = np.flatnonzero(np.repeat(~graph.fixed, 6))
+        J = J[:, moving]
+        H, gradient = (J.T @ J).tocsc(), -J.T @ (np.sqrt(self.weight)[:, None] * self.error).ravel()
+
+        def stepped(damping: float) -> tuple[_State, float]:
+            added = (damping * H.diagonal() + 1e-12)[None]
+            damped = H + sparse.dia_array((added, [0]), shape=H.shape).tocsc()
+            step = np.zeros(6 * count)
+            step[moving] = solve_symmetric(damped.tocsc(), gradient)
+            return _State.at(graph, se3_exp(step.reshape(-1, 6)) @ poses), 0.1
+
+        return stepped
 
 
 def _robust_share(chi2: Array | float) -> Array:
     """Return the root (...) of the weight of edges with a squared error."""
     return np.asarray(chi2_limit(6) / (chi2_limit(6) + chi2))
-
-
-def _solve(graph: PoseGraph, poses: Array, error: Array, weight: Array, damping: float) -> Array:
-    """Return the twists (K, 6) of the next step; a small error's derivative is that of the twists
-    themselves: e changes by xi_i - Ad(T_i_j) xi_j.
-    """
-    count, edges = len(poses), len(graph.i)
-    scale = (np.sqrt(weight)[:, None] / graph.sigma)[:, :, None]
-    J_i = scale * np.eye(6)
-    J_j = -scale * adjoint(poses[graph.i] @ invert(poses[graph.j]))
-    blocks = np.stack([J_i, J_j], axis=1).reshape(-1, 6, 6)
-    columns = np.stack([graph.i, graph.j], axis=1).ravel()
-    J = sparse.bsr_array(
-        (blocks, columns, 2 * np.arange(edges + 1)), shape=(6 * edges, 6 * count)
-    ).tocsr()
-    residual = (np.sqrt(weight)[:, None] * error).ravel()
-    moving = np.flatnonzero(np.repeat(~graph.fixed, 6))
-    J = J[:, moving]
-    H = (J.T @ J).tocsc()
-    diagonal = H.diagonal()
-    g = J.T @ residual
-    step = np.zeros(6 * count)
-    added = (damping * diagonal + 1e-12)[None]
-    damped = H + sparse.dia_array((added, [0]), shape=H.shape).tocsc()
-    step[moving] = -solve_symmetric(damped.tocsc(), g)
-    return step.reshape(-1, 6)

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from segfloor_ros.core.contracts import NO_POINT, Mount
-from segfloor_ros.core.geometry import Array, invert, is_within, transform_points
+from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.places.place_recognition import (
     PlaceRecognition,
     Sightings,
@@ -51,6 +51,7 @@ from segfloor_ros.core.slam.sparse_map import (
 )
 from segfloor_ros.core.slam.thresholds import ENOUGH, MOST, PROOF, SAME
 from segfloor_ros.core.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels
+from segfloor_ros.core.twists import is_within
 
 DRIFT_PER_M = 0.04, 0.01
 """Drift of a path in m and rad per m: stereo odometry drifts by one per cent or less."""

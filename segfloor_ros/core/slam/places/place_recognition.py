@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from segfloor_ros.core.files.arrays import Arrays, joined, split
-from segfloor_ros.core.geometry import Array, invert, is_within, transform_points
+from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.places.views import COLUMNS, ROWS
 from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES
 from segfloor_ros.core.slam.sparse_map import GroundView, KeyframeRecord, SparseMap, features_of
@@ -37,6 +37,7 @@ from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, ENOUGH, MOST, PROOF,
 from segfloor_ros.core.slam.tracking.images import Features, hamming
 from segfloor_ros.core.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels, Tracker
 from segfloor_ros.core.slam.tracking.track import Track
+from segfloor_ros.core.twists import is_within
 
 FILE = 'vocabulary.npy'
 BRANCHES, LEVELS = 30, 3

@@ -19,17 +19,15 @@ from segfloor_ros.core.contracts import BodySensors, LastPose, RelativeMotion
 from segfloor_ros.core.geometry import (
     Array,
     invert,
-    is_within,
     make_transform,
     rotation_angle,
     rotation_from_angles,
-    without_drift,
 )
 from segfloor_ros.core.slam.rig import is_gated
 from segfloor_ros.core.slam.thresholds import SAME, SPEED_SIGMA
 from segfloor_ros.core.slam.tracking.images import SMALL_WIDTH_PX
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate
-from segfloor_ros.core.twists import adjoint, se3_exp, se3_log
+from segfloor_ros.core.twists import adjoint, is_within, se3_exp, se3_log, without_drift
 
 MAX_TURN_RADPS = 6.0
 """A robot does not spin faster than once a second."""

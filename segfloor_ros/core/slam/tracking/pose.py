@@ -9,6 +9,7 @@ standing still. They are distinguished, not averaged, where they contradict each
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import UNKNOWN_COVARIANCE
 from segfloor_ros.core.geometry import Array, invert, make_transform, transform_points
+from segfloor_ros.core.least_squares import SHRINK, minimise
 from segfloor_ros.core.slam.rig import (
     MIN_DEPTH_M,
     SAME_PX,
@@ -132,7 +134,8 @@ def refine_pose(
     known = _Prior() if prior is None else _Prior.of(prior)
     pose, factor = T_camera_world, 1.0
     for _ in range(ROUNDS):
-        pose = _minimise(pose, seen.take(inliers), known)
+        state = _State(pose, seen.take(inliers), known)
+        pose = minimise(state, STEPS_PER_ROUND, CONVERGED).pose
         rays, _, chi2 = seen.at(pose)
         chi2[rays[2] >= 1 / MIN_DEPTH_M] = np.inf
         middle = float(np.median(chi2 / seen.median))
@@ -260,33 +263,37 @@ class _Seen:
         return J.reshape(6, -1)
 
 
-def _minimise(pose: Array, seen: _Seen, prior: _Prior) -> Array:
-    damping = 1e-4
-    rays, residual, chi2 = seen.at(pose)
-    pull, strain = prior.at(pose)
-    cost = huber_cost(chi2, seen.limit) + strain
-    for _ in range(STEPS_PER_ROUND):
-        root = np.sqrt(huber_weights(chi2, seen.limit))
-        J = seen.jacobian(rays, root)
-        H, g = J @ J.T + prior.information, J @ (residual * root).ravel() + pull
-        diagonal = H.ravel()[::7]
-        diagonal += damping * (diagonal + 1e-9)
-        step = np.linalg.solve(H, -g)
-        candidate = se3_exp(step) @ pose
-        if -g @ step < CONVERGED * cost:
-            return candidate
-        trial = seen.at(candidate)
-        trial_pull, strain = prior.at(candidate)
-        trial_cost = huber_cost(trial[2], seen.limit) + strain
-        if trial_cost <= cost:
-            converged = cost - trial_cost < CONVERGED * cost
-            pose, (rays, residual, chi2), pull, cost = candidate, trial, trial_pull, trial_cost
-            damping *= 0.2
-            if converged:
-                break
-        else:
-            damping *= 10.0
-    return pose
+class _State:
+    """A pose on trial, (4, 4), of points that are seen, and of what was known before. cost: where
+    that is known without a look at the points.
+    """
+
+    def __init__(self, pose: Array, seen: _Seen, prior: _Prior, cost: float | None = None) -> None:
+        self.pose, self._seen, self._prior = pose, seen, prior
+        if cost is None:
+            self._view, (self._pull, strain) = seen.at(pose), prior.at(pose)
+            cost = huber_cost(self._view[2], seen.limit) + strain
+        self.cost = cost
+
+    def linearised(self) -> Callable[[float], tuple[_State, float]]:
+        """Return what solves the normal equations for a damping."""
+        rays, residual, chi2 = self._view
+        root = np.sqrt(huber_weights(chi2, self._seen.limit))
+        J = self._seen.jacobian(rays, root)
+        H, g = J @ J.T + self._prior.information, J @ (residual * root).ravel() + self._pull
+
+        def stepped(damping: float) -> tuple[_State, float]:
+            damped = H.copy()
+            diagonal = damped.ravel()[::7]
+            diagonal += damping * (diagonal + 1e-9)
+            step = np.linalg.solve(damped, -g)
+            decrease = float(-g @ step)
+            # What is predicted to gain too little to go on is not computed.
+            cost = self.cost - decrease if decrease < CONVERGED * self.cost else None
+            trial = _State(se3_exp(step) @ self.pose, self._seen, self._prior, cost)
+            return trial, SHRINK
+
+        return stepped
 
 
 def knows_more(prior: PoseEstimate, fused: PoseEstimate) -> bool:
