@@ -17,7 +17,7 @@ from rich.table import Table
 from segfloor_ros.apps.cli import terminal
 from segfloor_ros.apps.cli.evaluate import map_table
 from segfloor_ros.apps.cli.printing import console
-from segfloor_ros.apps.cli.terminal import DriveOptions, ExploreOptions, number_option
+from segfloor_ros.apps.cli.terminal import ExploreOptions, number_option
 from segfloor_ros.apps.cli.view import open_view
 from segfloor_ros.apps.evaluation.map_score import compare, overlay_png, score_map
 from segfloor_ros.apps.evaluation.maps import load_truth
@@ -59,9 +59,12 @@ def run(
     maps = options.maps
     sees = None if options.network is None else open_network(options.network)
     configuration, source = options.open()
-    with open_view(options.view, options.inputs) as view:
+    with (
+        OutputFolder(options.out, options.inputs) as folder,
+        open_view(options.view, options.inputs) as view,
+    ):
         with (
-            _drive(options) as (folder, interrupt),
+            _interruptible() as interrupt,
             terminal.progress_bar('mapping', source.frame_count) as progress,
         ):
             drive = LockstepRun(
@@ -95,13 +98,11 @@ def run(
 
 
 @contextmanager
-def _drive(options: DriveOptions) -> Iterator[tuple[OutputFolder, Interrupt]]:
-    """The results folder of a drive, and the interrupt that ends it early: where there is no map
-    yet, the command ends.
-    """
-    with OutputFolder(options.out, options.inputs) as folder, first_interrupt_noted() as interrupt:
+def _interruptible() -> Iterator[Interrupt]:
+    """The interrupt that ends a drive early: where there is no map yet, the command ends."""
+    with first_interrupt_noted() as interrupt:
         try:
-            yield folder, interrupt
+            yield interrupt
         except MapError:
             terminal.end_if_interrupted(interrupt)
             raise
@@ -139,9 +140,12 @@ def replay(
         camera = dataclasses.replace(configuration.stereo_camera, depth=True)
         configuration = dataclasses.replace(configuration, stereo_camera=camera)
     loaded = maps.read(source.camera)
-    with open_view(options.view, options.inputs) as view:
+    with (
+        OutputFolder(options.out, options.inputs) as folder,
+        open_view(options.view, options.inputs) as view,
+    ):
         with (
-            _drive(options) as (folder, interrupt),
+            _interruptible() as interrupt,
             terminal.progress_bar('replaying', source.frame_count) as progress,
         ):
             keep = partial(folder.add_picture, 'floor_masks')

@@ -376,6 +376,8 @@ def _sweep(note: Path) -> None:
     with suppress(OSError, ValueError), note.open() as file:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # OSError: the process is there
         name, *inode = json.load(file)
+        if Path(name).name != note.name:
+            return  # no note of segfloor
         with suppress(OSError):
             facts = os.lstat(name)
             if [facts.st_dev, facts.st_ino] == inode and facts.st_uid == os.getuid():

@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from chessboards import write_boards
 from command_line import segfloor
 from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT
@@ -226,3 +227,27 @@ def test_the_longest_names_are_tried_before_the_first_frame(made, tmp_path):
     ):
         assert_refused([*map(str, words)], 'File name too long')
     assert {path.name for path in tmp_path.iterdir()} == {'o' * 255, longest}
+
+
+def test_calibration_files_of_the_user_stay(tmp_path):
+    """In the folder of pictures, or another one, which may hold other files."""
+    pictures = write_boards(tmp_path / 'pictures', 2)
+    (tmp_path / 'out').mkdir()
+    (tmp_path / 'out' / 'notes.txt').write_text('mine')
+    for words, target in (([], pictures), (['--out', tmp_path / 'out'], tmp_path / 'out')):
+        for name in ('left.yaml', 'right.yaml', 'calibration.html'):
+            (target / name).write_text('mine')
+            before = state_of(tmp_path)
+            assert_refused(['calibrate', str(pictures), '--square', '0.03', *map(str, words)])
+            assert state_of(tmp_path) == before
+            (target / name).unlink()
+
+
+def test_a_view_may_lie_in_the_folder_of_results(made, tmp_path):
+    pytest.importorskip('rerun')
+    out = tmp_path / 'out'
+    for _ in range(2):
+        done = segfloor('run', made / 'drive', '--out', out, f'--view={out / "drive.rrd"}',
+                        *KNOWN_MOUNT)  # fmt: skip
+        assert done.returncode == 0, done.stderr
+    assert (out / 'drive.rrd').stat().st_size > 1000

@@ -201,8 +201,13 @@ def test_what_a_killed_program_leaves_is_removed_by_the_next_one(tmp_path, monke
         programs[0].communicate(timeout=10)
         (kept,) = [tmp_path / 'killed' / '.segfloor-mine']
         kept.mkdir()
+        notes = tmp_path / 'cache' / 'segfloor' / 'temporary'
+        foreign = {'a.json': '["x", 1, 2]', 'b': '"text"', 'c': 'no JSON', 'd': '{"e": 1}'}
+        for name, text in foreign.items():
+            (notes / name).write_text(text)
         write_output(tmp_path / 'next.yaml', YAML, b'# written by segfloor')
         assert list((tmp_path / 'killed').iterdir()) == [kept]
+        assert foreign.keys() < {path.name for path in notes.iterdir()}
         assert len(list((tmp_path / 'works').glob('.segfloor-*'))) == 2
     finally:
         for program in programs:
