@@ -286,24 +286,18 @@ class OutputFolder:
         self._write_elsewhere(result, why)
 
     def _write_elsewhere(self, result: RunResult, why: str) -> None:
-        """Write to the folder for temporary files or the present one, wherever more can be."""
+        """Write what can be written to the folder for temporary files, or else the present one."""
         words = f'{self.path}: cannot be written ({why})'
-        tried: list[tuple[int, Path, dict[str, str]]] = []
-        for parent in (Path(tempfile.gettempdir()), Path.cwd()):
-            try:
-                folder = Path(tempfile.mkdtemp(prefix='segfloor-result-', dir=parent))
-            except OSError:
-                continue
-            failed = _write_files(folder, result)
-            tried.append((len(failed), folder, failed))
-            if not failed:
+        for parent in (tempfile.gettempdir(), '.'):
+            with suppress(OSError):
+                self.path = Path(tempfile.mkdtemp(prefix='segfloor-result-', dir=parent))
                 break
-        tried.sort(key=lambda one: one[0])
-        for _, folder, _ in tried[1:]:
-            shutil.rmtree(folder, ignore_errors=True)
-        if not tried or tried[0][0] == len(_writers(result)):
+        else:
             raise InputError(f'{words}; nor can it be elsewhere')
-        self.path, failed = tried[0][1:]
+        failed = _write_files(self.path, result)
+        if len(failed) == len(_writers(result)):
+            self.path.rmdir()
+            raise InputError(f'{words}; nor can it be in {self.path}')
         for name in PICTURES:
             with suppress(OSError):
                 shutil.copytree(self._made / name, self.path / name)

@@ -40,6 +40,7 @@ from segfloor_ros.core.processes import (
     interrupts_deferred,
     start_apart,
 )
+from segfloor_ros.core.standard_error import own_standard_error
 
 LOG = 'log.txt'
 
@@ -299,6 +300,7 @@ def _work(pipe: Connection, job: Job, origin: Outcome | None, folder: Path, chec
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _ended)
     end_with_parent(check)
+    own_standard_error()
     try:
         with tempfile.TemporaryDirectory(dir=folder) as own:
             tempfile.tempdir = own

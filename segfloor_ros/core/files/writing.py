@@ -17,7 +17,6 @@ import os
 import shutil
 import struct
 import tempfile
-import threading
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -180,11 +179,10 @@ def check_target(
 
 
 def _check_kind(target: Path) -> None:
-    with os_errors(f'{target}: cannot be written', '; choose another --out'):
-        if target.is_symlink():
-            raise InputError(f'{target}: is a link; choose another --out')
-        if os.path.lexists(target) and not target.is_dir():
-            raise InputError(f'{target}: exists and is no folder; choose another --out')
+    if target.is_symlink():
+        raise InputError(f'{target}: is a link; choose another --out')
+    if os.path.lexists(target) and not target.is_dir():
+        raise InputError(f'{target}: exists and is no folder; choose another --out')
 
 
 def _check_folder(target: Path) -> None:
@@ -339,67 +337,50 @@ def _in_the_way(folder: Path, names: Iterable[str], own: Iterable[str]) -> list[
     return found
 
 
-class _Journal:
-    """The temporary files and folders of this process, in a locked file of the user's cache. What
-    the journal of a process that is gone lists, by device and inode, is removed.
+@contextmanager
+def _removed_at_last(path: Path) -> Iterator[None]:
+    """Remove a temporary file or folder at the end of the block, or by a later process."""
+    with ExitStack() as stack:
+        with suppress(OSError):  # without a note it stays where this process is killed
+            stack.enter_context(_noted(path))
+        try:
+            yield
+        finally:
+            _remove(path)
+
+
+@contextmanager
+def _noted(path: Path) -> Iterator[None]:
+    """Note a temporary file or folder in the cache of the user, by device and inode, in a file that
+    is locked during the block. What the notes of processes that are gone name is removed.
     """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._file: IO[str] | None = None
-        self._name = ''
-        self._process = 0
-        self._entries: dict[str, tuple[int, int]] = {}
-
-    def add(self, path: Path) -> None:
-        """Note what was made."""
-        facts = path.lstat()
-        with self._lock, suppress(OSError):
-            self._open()
-            self._entries[str(path.absolute())] = facts.st_dev, facts.st_ino
-            self._write()
-
-    def remove(self, path: Path) -> None:
-        """Note that it is gone."""
-        with self._lock, suppress(OSError):
-            if self._entries.pop(str(path.absolute()), None) is not None:
-                self._write()
-            if not self._entries and self._file is not None:
-                os.unlink(self._name)
-                self._file.close()
-                self._file = None
-
-    def _open(self) -> None:
-        if self._file is not None and self._process == os.getpid():
-            return
-        home = os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache'
-        folder = Path(home) / 'segfloor' / 'temporary'
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        for journal in folder.glob('*.json'):
-            _sweep(journal)
-        number, self._name = tempfile.mkstemp('.json', dir=folder)
-        self._file = os.fdopen(number, 'w')
-        self._process, self._entries = os.getpid(), {}
-        fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-    def _write(self) -> None:
-        if self._file is not None:
-            self._file.seek(0)
-            self._file.truncate()
-            json.dump(self._entries, self._file)
-            self._file.flush()
+    facts = path.lstat()
+    home = os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache'
+    notes = Path(home) / 'segfloor' / 'temporary'
+    notes.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for note in notes.iterdir():
+        _sweep(note)
+    note = notes / path.name
+    with note.open('x') as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX)  # another process may look at it just now
+            json.dump([str(path.absolute()), facts.st_dev, facts.st_ino], file)
+            file.flush()
+            yield
+        finally:
+            note.unlink(missing_ok=True)
 
 
-def _sweep(journal: Path) -> None:
-    """Remove what a journal lists, if its process is gone."""
-    with suppress(OSError, ValueError), journal.open() as file:
+def _sweep(note: Path) -> None:
+    """Remove what a note names, if its process is gone."""
+    with suppress(OSError, ValueError), note.open() as file:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # OSError: the process is there
-        for name, inode in json.load(file).items():
-            with suppress(OSError):
-                facts = os.lstat(name)
-                if [facts.st_dev, facts.st_ino] == inode and facts.st_uid == os.getuid():
-                    _remove(Path(name))
-        journal.unlink()
+        name, *inode = json.load(file)
+        with suppress(OSError):
+            facts = os.lstat(name)
+            if [facts.st_dev, facts.st_ino] == inode and facts.st_uid == os.getuid():
+                _remove(Path(name))
+        note.unlink()
 
 
 def _remove(path: Path) -> None:
@@ -407,17 +388,3 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)
-
-
-_journal = _Journal()
-
-
-@contextmanager
-def _removed_at_last(path: Path) -> Iterator[None]:
-    """Remove a temporary file or folder at the end of the block, or by a later process."""
-    _journal.add(path)
-    try:
-        yield
-    finally:
-        _remove(path)
-        _journal.remove(path)

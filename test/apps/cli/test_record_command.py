@@ -86,7 +86,7 @@ import sys, time
 from pathlib import Path
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.bag_writer import BagWriter, ImageCoding
-from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.camera.settings import StereoCameraSettings
 source = open_source(StereoCameraSettings(input=sys.argv[1]))
 with BagWriter(Path(sys.argv[2]), source.calibration, ImageCoding.raw, keeps=True) as bag:
     for pair in source.raw_pairs():

@@ -71,12 +71,13 @@ def test_a_recording_is_mapped_without_extras(tmp_path) -> None:
     [
         (('check', 'suite.yaml', '--out', 'out'), 'junitparser', 'cli'),
         (('evaluate', 'trajectory', 'a.txt', 'b.txt'), 'evo', 'cli'),
-        (('view', 'out'), 'rerun', 'view'),
+        (('view', 'room'), 'rerun', 'view'),
         (('simulate', 'corridor1', '--out', 'out'), 'MuJoCo', 'sim'),
     ],
 )
 def test_a_command_says_in_one_line_which_extra_it_needs(words, package, extra, tmp_path) -> None:
-    words = [str(tmp_path / word) if word == 'out' else word for word in words]
+    write_kitti(tmp_path / 'room', room_drive(2)[0])
+    words = [str(tmp_path / word) if word in ('out', 'room') else word for word in words]
     done = without(EXTRAS, *words)
     assert done.returncode == 2
     assert done.stderr.startswith('segfloor: ') and done.stderr.count('\n') == 1

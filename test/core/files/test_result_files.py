@@ -15,7 +15,6 @@ from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.writing import (
     MARKER,
     YAML,
-    _journal,
     add_files,
     check_output,
     check_target,
@@ -202,7 +201,6 @@ def test_what_a_killed_program_leaves_is_removed_by_the_next_one(tmp_path, monke
         programs[0].communicate(timeout=10)
         (kept,) = [tmp_path / 'killed' / '.segfloor-mine']
         kept.mkdir()
-        monkeypatch.setattr('segfloor_ros.core.files.writing._journal', type(_journal)())
         write_output(tmp_path / 'next.yaml', YAML, b'# written by segfloor')
         assert list((tmp_path / 'killed').iterdir()) == [kept]
         assert len(list((tmp_path / 'works').glob('.segfloor-*'))) == 2

@@ -119,10 +119,10 @@ def image_slope(image: NDArray[np.uint8]) -> NDArray[np.float32]:
     half the resolution in both directions.
     """
     smooth = cv2.blur(image, (5, 5))[::STEP_PX, ::STEP_PX]
-    return cv2.magnitude(
-        cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8),
-        cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8),
-    )
+    across = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8)
+    along = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8)
+    # cv2.magnitude rounds by where its arrays lie in memory, so from run to run.
+    return np.sqrt(across * across + along * along)
 
 
 def _top_of_supported(

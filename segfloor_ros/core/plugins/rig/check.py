@@ -448,7 +448,7 @@ def _edge_px(image: NDArray[np.uint8]) -> float:
     quarter = len(image) // 4
     smooth = cv2.GaussianBlur(image[quarter:-quarter], (0, 0), 0.8)
     across, along = (cv2.Sobel(smooth, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))
-    slope = cv2.magnitude(across, along)
+    slope = np.sqrt(across * across + along * along)  # as in `image_slope`
     patch = np.ones((WINDOW_PX, WINDOW_PX), np.uint8)
     step = cv2.morphologyEx(smooth, cv2.MORPH_GRADIENT, patch)
     is_edge = (slope >= np.percentile(slope[::2, ::2], 95)) & (step > DARK_GREY)

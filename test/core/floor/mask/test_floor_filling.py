@@ -6,7 +6,7 @@ from floor_scenes import CAMERA, FLOORS, MOUNT, Patch, Scene, floor_patch, wall
 
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.floor.disparity.profile import FloorView
-from segfloor_ros.core.floor.mask.filling import beside_something, drop_islands
+from segfloor_ros.core.floor.mask.filling import beside_something, drop_islands, image_slope
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
@@ -79,3 +79,20 @@ def test_a_wall_right_beside_the_camera_is_not_filled(floor_kind):
     mask = FloorSegmentation(CAMERA, FloorSegmentationSettings()).process(left, right, MOUNT).mask
     assert (mask == FLOOR)[~floor & (depth < 0.8)].mean() < 0.05
     assert (mask == FLOOR)[floor & (depth > 0.5) & (depth < 3.0)].mean() > 0.95
+
+
+def test_the_slope_of_an_image_does_not_depend_on_where_it_lies_in_memory() -> None:
+    """So that two runs give the same bytes; of a ramp it is known."""
+    image = np.random.default_rng(1).integers(0, 255, (240, 318)).astype(np.uint8)
+    found = set()
+    for offset in range(0, 64, 4):
+        memory = np.zeros(image.size + 128, np.uint8)
+        start = -memory.ctypes.data % 64 + offset
+        copy = memory[start : start + image.size].reshape(image.shape)
+        copy[:] = image
+        held = [np.empty(offset + 1, np.float32)]  # moves what is allocated next
+        found.add(image_slope(copy).tobytes())
+        del held
+    assert len(found) == 1
+    ramp = np.tile(np.arange(0, 240, 2, dtype=np.uint8), (80, 1))
+    np.testing.assert_array_equal(image_slope(ramp)[5:-5, 5:-5], 4.0)
