@@ -17,6 +17,9 @@ from segfloor_ros.core.geometry import Array
 X = TypeVar('X')
 Stage = TypeVar('Stage')
 
+LEAST = 1e-9
+"""Information that is none."""
+
 
 def gauss_newton(
     x: X,
@@ -30,13 +33,13 @@ def gauss_newton(
 
     linearise: returns of a solution the information J^T W J (K, K), the gradient J^T W r (K,) of
     residuals measured minus expected, both with what is known before, and any remark. apply:
-    returns the solution after a step (K,). free: the unknowns that move, (K,) bool or a slice.
-    Where the information has no inverse the step is the shortest (Triggs et al., Bundle Adjustment:
-    A Modern Synthesis, 2000, sections 3.3 and 4).
+    returns the solution after a step (K,). free: the unknowns that move, (K,) bool or a slice; one
+    of which nothing is known stays, too (Triggs et al., Bundle Adjustment: A Modern Synthesis,
+    2000, sections 3.3 and 4).
     """
     for stage in schedule:
         information, gradient, remark = linearise(x, stage)
-        step = np.zeros(len(gradient))
-        step[free] = np.linalg.lstsq(information[free][:, free], gradient[free], rcond=None)[0]
+        step, H = np.zeros(len(gradient)), information + LEAST * np.eye(len(gradient))
+        step[free] = np.linalg.solve(H[free][:, free], gradient[free])
         x = apply(x, step)
     return x, information, remark

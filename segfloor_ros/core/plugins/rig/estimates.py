@@ -87,6 +87,10 @@ FOCAL_SHARE = 0.03
 MOTION_STEPS, STEPS = 5, 15
 """Of the fit: the first ones find the motion alone."""
 
+MOTION_SIGMA = 100.0
+"""Of a step of the motion, in metres and radians: where points determine it, this changes nothing.
+"""
+
 PRIOR_SIGMA = 0.5
 """Of the logarithm of the factor: images may be half or twice as large as those calibrated."""
 
@@ -322,7 +326,7 @@ def _fit_motion(camera: StereoCamera, then: Array, now: Array) -> tuple[Array, A
     # All is in front of the camera.
     x = np.array([0.0, min(0.0, float(then[:, 2].min()) - ROWS_PX)])
     state: tuple[Array, Array] = np.eye(4), x
-    known = np.diag([0.0] * 6 + [PRIOR_SIGMA**-2, WINDOW_PX**-2])
+    known = np.diag([MOTION_SIGMA**-2] * 6 + [PRIOR_SIGMA**-2, WINDOW_PX**-2])
 
     def linearise(state: tuple[Array, Array], _: int) -> tuple[Array, Array, float]:
         T, x = state
