@@ -16,16 +16,7 @@ import typer
 from rich.table import Table
 
 from segfloor_ros import __version__
-from segfloor_ros.apps.benchmark import (
-    JSON_VERSION,
-    MeasuredStages,
-    Progress,
-    Workload,
-    machine,
-    run_in_process,
-)
 from segfloor_ros.apps.cli import terminal as options
-from segfloor_ros.apps.cli.evaluate import stage_table, workload_table
 from segfloor_ros.apps.cli.main import run_command
 from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.apps.cli.terminal import Announce, announcing, figure_table
@@ -46,6 +37,16 @@ from segfloor_ros.core.errors import MapError
 from segfloor_ros.core.grid.occupancy import OccupancyGrid, OccupancyGridSettings
 from segfloor_ros.nodes.configuration import resolve
 from segfloor_ros.nodes.map_files import save_map
+from tools.benchmark_stages import (
+    JSON_VERSION,
+    MeasuredStages,
+    Progress,
+    Workload,
+    machine,
+    run_in_process,
+    stage_table,
+    workload_table,
+)
 from tools.driving import drive, open_recording
 from tools.published_figures import (
     PUBLISHED,

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.apps.benchmark import CAMERA, DRIVE, MOUNT, CorridorImages
 from segfloor_ros.apps.cli.terminal import Announce
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.configuration import Configuration
@@ -21,6 +20,7 @@ from segfloor_ros.core.floor.segmentation import DISPARITY, DISPARITY_ABOVE, Flo
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.plugins.assembly import make_slam
 from segfloor_ros.core.timing import StageTimes
+from tools.benchmark_stages import CAMERA, DRIVE, MOUNT, CorridorImages
 from tools.driving import drive, open_recording
 
 WHOLE, WITHOUT_DISPARITY = 'all', 'all but disparity'

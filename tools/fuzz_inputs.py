@@ -16,7 +16,6 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.apps.benchmark import CAMERA, MOUNT, CorridorImages
 from segfloor_ros.apps.cli.main import program
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.bag_writer import convert
@@ -24,6 +23,7 @@ from segfloor_ros.apps.recordings.calibration_files import write_ros_calibration
 from segfloor_ros.core.camera.calibration import EyeCalibration
 from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.contracts import FLOOR, NOT_FLOOR
+from tools.benchmark_stages import CAMERA, MOUNT, CorridorImages
 
 FRAMES = 4
 SCALE = 4

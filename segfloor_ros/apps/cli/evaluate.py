@@ -13,22 +13,13 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from segfloor_ros.apps.benchmark import (
-    BenchmarkPlan,
-    Step,
-    Workload,
-    as_document,
-    parse_sizes,
-    profile_recording,
-    run_benchmark,
-)
+from segfloor_ros.apps.benchmark import Step, profile_recording
 from segfloor_ros.apps.cli import terminal
 from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.apps.cli.terminal import (
     Json,
     Params,
     Set,
-    announcing,
     figure_table,
     needing_ros,
     number_option,
@@ -62,9 +53,6 @@ from segfloor_ros.core.files.whole import number, read_table
 from segfloor_ros.core.files.writing import PNG, check_output, marked_png, write_output
 from segfloor_ros.core.geometry import Pose2d
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.nodes.configuration import resolve
-
-DEFAULT = BenchmarkPlan()
 
 app = typer.Typer(help='Score a map, a trajectory or floor masks against the truth.')
 
@@ -287,19 +275,10 @@ def _percent(spread: Spread) -> str:
 
 def benchmark(
     recording: Annotated[
-        str | None,
-        typer.Argument(help='Print the share of each step of a frame and of a keyframe of this.'),
+        str | None, typer.Argument(help='Recording; else the drive of segfloor demo.')
     ] = None,
-    sizes: Annotated[
-        str, typer.Option(help='Keyframes for labelling and grid, one run for each number.')
-    ] = ','.join(map(str, DEFAULT.sizes)),
-    frames: Annotated[
-        int, number_option('Image pairs for all stages, generated or recorded.', 2)
-    ] = DEFAULT.frames,
-    seed: Annotated[int, number_option('Of the generated data.', 0)] = DEFAULT.seed,
-    threads: Annotated[
-        int, number_option('Threads of OpenCV; one compares machines best.', 1)
-    ] = DEFAULT.threads,
+    frames: Annotated[int, number_option('Image pairs of the recording.', 2)] = 100,
+    threads: Annotated[int, number_option('Threads of OpenCV; one compares machines best.', 1)] = 1,
     nodes: Annotated[
         str | None,
         typer.Option(
@@ -313,32 +292,27 @@ def benchmark(
     params: Params = None,
     assignments: Set = None,
 ) -> None:
-    """Time, memory and throughput of the stages, also as multiples of a fixed OpenCV workload.
+    """Print the time of each step of a frame and of a keyframe, or the cost of the nodes.
 
     \b
-    segfloor benchmark --json > figures.json
-    segfloor benchmark drive.mcap
+    segfloor benchmark
+    segfloor benchmark drive.mcap --json > figures.json
     segfloor benchmark --nodes drive.mcap
     """
     if nodes is not None:
         configuration = terminal.configuration(params, assignments, nodes)
         return print_node_figures(configuration, rate, as_json=as_json)
-    plan = BenchmarkPlan(parse_sizes(sizes), frames, seed, threads)
-    if recording is not None:
-        configuration = terminal.configuration(params, assignments, recording)
-        source = open_source(configuration.stereo_camera)
-        with progress_bar('measuring', frames) as progress:
-            steps = profile_recording(source, plan, configuration, progress)
-        if as_json:
-            return print_json({'steps': [dataclasses.asdict(step) for step in steps]})
-        return console.print(step_table(steps))
-    configuration = resolve(params, assignments or ())
-    with announcing() as announce:
-        workloads = run_benchmark(plan, configuration, announce)
+    if recording is None:
+        from segfloor_ros.apps.cli.commands import DRIVE
+
+        recording = str(DRIVE / 'drive.mcap')
+    configuration = terminal.configuration(params, assignments, recording)
+    source = open_source(configuration.stereo_camera)
+    with progress_bar('measuring', frames) as progress:
+        steps = profile_recording(source, frames, threads, configuration, progress)
     if as_json:
-        return print_json(as_document(plan, workloads))
-    console.print(stage_table(workloads))
-    console.print(workload_table(workloads))
+        return print_json({'steps': [dataclasses.asdict(step) for step in steps]})
+    console.print(step_table(steps))
 
 
 def print_node_figures(
@@ -367,41 +341,5 @@ def step_table(steps: list[Step]) -> Table:
     table.caption = (
         'tracking: of each frame; moving: of each search for what moves; the others: of each '
         'keyframe; steps are part of the step above; computed on one thread'
-    )
-    return table
-
-
-def stage_table(workloads: list[Workload]) -> Table:
-    """Return the time of every stage as a table."""
-    table = figure_table('stage', 'calls', 'median ms', 'p95 ms', 'max ms', 'median / reference')
-    for workload in workloads:
-        table.add_row(Text(workload.name, 'bold'))
-        for name, stage in workload.stages.items():
-            times = (f'{stage[key]:.2f}' for key in ('p50_ms', 'p95_ms', 'max_ms'))
-            ratio = f'{stage["p50_ratio"]:.3f}'
-            table.add_row(f'  {name}', str(stage['count']), *times, ratio)
-        table.add_row('  reference', '', f'{workload.reference_ms:.2f}', '', '', '1.000')
-        table.add_section()
-    table.caption = 'reference: ORB and semi-global matching of a fixed 640x480 pair, timed beside'
-    return table
-
-
-def workload_table(workloads: list[Workload]) -> Table:
-    """Return throughput, map updates and memory of every workload as a table."""
-    table = figure_table(
-        'workload', 'items/s', 's/update', 'p95 s', 'max s', 'peak MB', 'MB/update'
-    )
-    for workload in workloads:
-        updates = (f'{workload.update_s.get(key, 0.0):.4f}' for key in ('mean', 'p95', 'max'))
-        table.add_row(
-            workload.name,
-            f'{workload.items_per_s:.1f}',
-            *updates,
-            f'{workload.memory_mb["peak"]:.0f}',
-            f'{workload.memory_mb["slope_per_update"]:.3f}',
-        )
-    table.caption = (
-        'items: frames, or keyframes where there are no images; update: all that is done once per '
-        'keyframe, the map included; one thread; memory grows by the slope of the second half'
     )
     return table
