@@ -32,14 +32,27 @@ def end_with_parent(parent_id: int) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
+def _begin(work: Callable[..., None], *arguments: Any) -> None:
+    """Do the work of a new process, which takes signals from now on."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    work(*arguments)
+
+
 def start_apart(work: Callable[..., None], *arguments: Any) -> tuple[Connection, SpawnProcess]:
     """Start `work(pipe, *arguments)` in a new process; returns the other end of the pipe, and the
     process. Spawned: a fork would copy the locks of the threads of OpenCV and BLAS.
     """
     context = multiprocessing.get_context('spawn')
     pipe, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=work, args=(theirs, *arguments))
-    process.start()
+    process = context.Process(target=_begin, args=(work, theirs, *arguments))
+    with interrupts_deferred():
+        # The new process inherits the mask: no signal breaks its imports.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+        try:
+            process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
     theirs.close()
     return pipe, process
 
