@@ -51,8 +51,8 @@ def mapping(process: psutil.Process) -> bool:
 def alone(room, tmp_path_factory) -> Path:
     """The suite's results by one process."""
     folder = tmp_path_factory.mktemp('alone')
-    finish(start_check(room, folder, '--out', str(folder)))
-    return folder
+    finish(start_check(room, folder, '--out', str(folder / 'out')))
+    return folder / 'out'
 
 
 def finish(check: subprocess.Popen[str]) -> str:
