@@ -41,18 +41,18 @@ def _begin(work: Callable[..., None], *arguments: Any) -> None:
 
 def start_apart(work: Callable[..., None], *arguments: Any) -> tuple[Connection, SpawnProcess]:
     """Start `work(pipe, *arguments)` in a new process; returns the other end of the pipe, and the
-    process. Spawned: a fork would copy the locks of the threads of OpenCV and BLAS.
+    process. Spawned: a fork would copy the locks of the threads of OpenCV and BLAS. Call it within
+    `interrupts_deferred`, with the note that it runs.
     """
     context = multiprocessing.get_context('spawn')
     pipe, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_begin, args=(work, theirs, *arguments))
-    with interrupts_deferred():
-        # The new process inherits the mask: no signal breaks its imports.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-        try:
-            process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    # The new process inherits the mask: no signal breaks its imports.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     theirs.close()
     return pipe, process
 

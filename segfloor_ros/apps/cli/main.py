@@ -57,7 +57,7 @@ COMMANDS = {
     ),
     'benchmark': (
         'evaluate:benchmark',
-        'Time, memory and throughput of the stages, also as multiples of a fixed OpenCV workload.',
+        'Print the time of each step of a frame and of a keyframe, or the cost of the nodes.',
     ),
     'demo': (
         'commands:demo',

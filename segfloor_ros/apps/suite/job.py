@@ -268,8 +268,9 @@ def _local(processes: int, jobs: list[Job], kept: Mapping[str, Outcome]) -> Gene
                 for job in ready[: processes - len(running)]:
                     waiting.remove(job)
                     origin = done.get(job.entry.continue_from)
-                    pipe, process = start_apart(_work, job, origin, Path(folder), os.getpid())
-                    running[pipe] = job, process
+                    with interrupts_deferred():
+                        pipe, process = start_apart(_work, job, origin, Path(folder), os.getpid())
+                        running[pipe] = job, process
                 finished = wait(list(running))
                 for pipe in [pipe for pipe in running if pipe in finished]:
                     outcome = _receive(pipe, *running.pop(pipe))

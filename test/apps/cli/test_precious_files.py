@@ -7,6 +7,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -202,7 +203,7 @@ def test_what_segfloor_wrote_is_replaced_and_what_was_changed_since_is_not(made,
         (['map', 'diff', saved, made / 'home.map'], 'changes.png'),
         (['evaluate', 'map', out, out, '--overlay'], 'overlay.png'),
         (['evaluate', 'trajectory', *2 * [out / 'trajectory.txt'], '--plot'], 'plot.svg'),
-        (['view', made / 'result', '--out'], 'view.rrd'),
+        *([(['view', made / 'result', '--out'], 'view.rrd')] if find_spec('rerun') else []),
     ):
         for _ in range(2):
             done = segfloor(*command_line, tmp_path / name)
