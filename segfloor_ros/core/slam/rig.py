@@ -52,6 +52,10 @@ SAME_PX = 4
 disparity, is known roughly."""
 
 
+MAX_DISPARITY_SHARE = 0.5
+"""Largest disparity, as a share of the image's width."""
+
+
 @dataclass(frozen=True)
 class OffsetEstimate:
     """Value of the offset, measured minus true disparity, and its information in 1/px²."""

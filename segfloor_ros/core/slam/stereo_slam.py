@@ -539,6 +539,8 @@ def _carried(result: FrameResult, motion: CameraMotion, covariance: Array) -> Fr
     (6, 6), of the last pose.
     """
     expected = motion.expected(result.stamp_ns)
+    if expected is None:
+        return result
     return replace(
         result,
         tracked=True,

@@ -125,8 +125,6 @@ class BackEnd:
             return False
         if track is None:
             return not self._map.keyframes or front_end.is_new_place()
-        if track.is_poor and frames_since < self._longest_frames // 3:
-            return False
         since_ns = stamp_ns - front_end.keyframe_ns
         return front_end.local.wants_keyframe(track, frames_since, since_ns, self.idle)
 

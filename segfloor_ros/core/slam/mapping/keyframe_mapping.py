@@ -27,7 +27,7 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     gather,
 )
 from segfloor_ros.core.slam.mapping.normal_equations import factors_of
-from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, SAME_PX
+from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, MAX_DISPARITY_SHARE, NEIGHBOURS, SAME_PX
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, ENOUGH, MAJORITY, NEARLY_ALL, PROOF
 from segfloor_ros.core.slam.tracking.images import (
@@ -48,9 +48,6 @@ MIN_DISPARITY_PX = 1.0
 SETTLING_KEYFRAMES, MIN_FOUND_RATIO = 2, 0.25
 """Within so many keyframes others must see a new point too, and in this share of the frames that
 should show it a point must be found (Mur-Artal et al., ORB-SLAM, 2015, section VI-B)."""
-
-MAX_DISPARITY_SHARE = 0.5
-"""Largest disparity, as a share of the image's width."""
 
 MIN_TEXTURE = 5
 MAX_OCTAVES_APART, CANDIDATES = 2.5, 4

@@ -4,7 +4,7 @@ black, white, only half delivered, or the same as before.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -22,38 +22,25 @@ from segfloor_ros.core.slam.places.place_recognition import (
     greatest_speed_mps,
     is_within,
 )
-from segfloor_ros.core.slam.places.views import ALIKE_SHARE
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
-from segfloor_ros.core.slam.thresholds import ENOUGH, MAJORITY, MOST, SAME
+from segfloor_ros.core.slam.thresholds import MOST, SAME
+from segfloor_ros.core.slam.tracking.evidence import is_proof
 from segfloor_ros.core.slam.tracking.images import FeatureExtractor, Features, Images, is_inside
-from segfloor_ros.core.slam.tracking.map_tracking import Follower, LocalMap, Tracker
+from segfloor_ros.core.slam.tracking.map_tracking import WIDE_PX, Follower, LocalMap, Start, Tracker
 from segfloor_ros.core.slam.tracking.motion import (
     CameraMotion,
     ImageRotation,
     TrackingState,
     sigma_m,
 )
-from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE, count_firm, with_patch_noise
-from segfloor_ros.core.slam.tracking.pose import (
-    FIRST_INFORMATION,
-    MIN_FOUND,
-    PoseEstimate,
-    differ,
-    knows_more,
-    refine_pose,
-)
+from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE, with_patch_noise
+from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ, knows_more, refine_pose
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
 
 MIN_EXPECTED_SHIFT = 0.004
 """Motion of the picture, in widths per frame, that cannot stop from one frame to the next."""
-
-PLENTY = 100
-"""With so many points in view the place is certain enough, whatever they are, also where the
-sensors have the camera somewhere else: wheels slip. A view that begins anew needs twice as many: it
-may be of another place. Wheels measure the pose better than fewer than half of them, spread over
-the image, that do not slide along edges, and an IMU alone better than fewer than a quarter."""
 
 
 class FrontEnd:
@@ -65,7 +52,7 @@ class FrontEnd:
     def __init__(
         self, settings: StereoSlamSettings, sparse_map: SparseMap, body: BodySensors
     ) -> None:
-        self.motion = CameraMotion(settings.max_speed_mps, body)
+        self.motion = CameraMotion(body)
         self.local = LocalMap(sparse_map, settings.keyframe_max_frames)
         self.follower = Follower(sparse_map)
         self.tracker = Tracker(sparse_map)
@@ -141,21 +128,16 @@ class FrontEnd:
         it is in this map, as that was found while the camera was in a submap.
         """
         self._rotation.see(images.small)
+        expected = self.motion.expected(frame.stamp_ns)
         if found is not None:
             features = self.extractor.extract(frame.left, images.excluded)
             track = self._relocalise(images, features, frame.stamp_ns, found)
         else:
-            prediction = self.motion.predict(frame.stamp_ns)
-            track = self.follower.follow(images, self.local.point_ids, prediction)
+            track = self._followed(frame, images, expected)
         if track is None:
-            track = self._search(frame, images)
-        if track is None or not self.is_believable(track, images, frame.stamp_ns):
             self.follower.reset()
             return None
-        if not self.motion.state.is_lost and len(track.point_ids) < PLENTY:
-            nothing = replace(track.estimate, covariance=np.diag(1 / FIRST_INFORMATION))
-            by_patches = _with_prior(self._map, track, images, nothing)
-            track = replace(track, sigma_m=sigma_m(by_patches.covariance))
+        track = replace(track, sigma_m=sigma_m(track.covariance))
         T_seen = track.T_camera_world
         track = self._weighed(replace(track, prior=self.motion.prior(frame.stamp_ns)), images)
         self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
@@ -166,23 +148,38 @@ class FrontEnd:
         self.frames_since_keyframe += 1
         return track
 
-    def is_believable(self, track: Track, images: Images, stamp_ns: int) -> bool:
-        """Whether the camera can have come to where the images have it."""
-        motion, pose = self.motion, track.T_camera_world
-        if motion.state.is_lost:
-            return motion.is_heading_possible(pose, stamp_ns)
-        measured = motion.measured(stamp_ns)
-        by_imu = measured is not None and measured.source == 'IMU'
-        few = PLENTY // 2 if motion.prior(stamp_ns) else PLENTY // 4 if by_imu else 0
-        if few and count_firm(images.left, track.uv_px) < few:
-            return False
-        if motion.is_consistent(pose, track.covariance, stamp_ns):
-            return motion.state.is_resuming or motion.is_plausible(pose, stamp_ns)
-        if motion.state.is_resuming:
-            return False
-        if motion.state.is_blind:
-            return len(track.point_ids) >= 2 * PLENTY and _recognised(track, MAJORITY)
-        return len(track.point_ids) >= PLENTY and _recognised(track, ALIKE_SHARE)
+    def _followed(
+        self, frame: StereoFrame, images: Images, expected: PoseEstimate | None
+    ) -> Track | None:
+        """Return the pose by what the last frame showed; by the features of this one where that is
+        no proof, or not where the camera was expected.
+        """
+        prediction = self.motion.predict(frame.stamp_ns)
+        followed = self.follower.follow(images, self.local.point_ids, prediction)
+        if followed is not None and not is_proof(followed.evidence(expected)):
+            followed = None
+        if followed is not None and followed.fits(expected):
+            return followed
+        features = self.extractor.extract(frame.left, images.excluded)
+        starts = self._starts(frame, features, followed)
+        found = self.tracker.best(images, features, self.local.point_ids, starts, expected)
+        tracks = [track for track in (followed, found) if track is not None]
+        if not tracks and self.motion.state is not TrackingState.TRACKING:
+            return self._relocalise(images, features, frame.stamp_ns)
+        return max(tracks, key=lambda track: track.evidence(expected), default=None)
+
+    def _starts(
+        self, frame: StereoFrame, features: Features, followed: Track | None
+    ) -> Iterator[Start]:
+        """Yield where the camera may be, what costs least first."""
+        predictions = self._predict_poses(frame)
+        if followed is not None:
+            predictions.insert(0, followed.T_camera_world)
+        yield from (Start(T_camera_world) for T_camera_world in predictions)
+        yield Start(predictions[0], WIDE_PX)
+        located = self.tracker.by_descriptors(features, self.local.point_ids)
+        if located is not None:
+            yield located
 
     def _weighed(self, track: Track, images: Images) -> Track:
         """Return a track with the likeliest pose by images and prior; that of the images where the
@@ -209,41 +206,6 @@ class FrontEnd:
         measured = self.motion.measured_pose(frame.stamp_ns)
         return [steady, turned] if measured is None else [measured, steady, turned]
 
-    def _search(self, frame: StereoFrame, images: Images) -> Track | None:
-        """Find the pose by the features of the frame, without its predecessor."""
-        features = self.extractor.extract(frame.left, images.excluded)
-        predictions = self._predict_poses(frame)
-        track = self.tracker.track(images, features, self.local.point_ids, predictions)
-        if self.motion.state is TrackingState.TRACKING:
-            return self._carry_on(images, features, frame.stamp_ns, track)
-        if track is not None and _recognised(track, MIN_FOUND):
-            return track
-        return self._relocalise(images, features, frame.stamp_ns)
-
-    def _carry_on(
-        self, images: Images, features: Features, stamp_ns: int, track: Track | None
-    ) -> Track | None:
-        """Return the pose that the motion so far leads to, where it explains more points that have
-        a record of standing still, or where a pose is poor, nearly as many: what comes close and
-        fills the image has the most points, and takes the pose along.
-        """
-        is_poor = track is None or not _recognised(track, MIN_FOUND)
-        steady = self.motion.expected(stamp_ns)
-        close = self.tracker.track_at(
-            images, features, self.local.point_ids, steady.T_camera_world, steady, is_given=True
-        )
-        found = None if track is None else replace(track, is_poor=is_poor)
-        if close is None or len(close.point_ids) < ENOUGH:
-            return found
-        if found is not None:
-            by_images, explained = (
-                self.tracker.consensus.proven(t.point_ids, t.T_camera_world).sum()
-                for t in (found, close)
-            )
-            if explained <= (MOST if is_poor else 1.0) * by_images:
-                return found
-        return replace(close, is_poor=True)
-
     def _relocalise(
         self, images: Images, features: Features, stamp_ns: int, found: Track | None = None
     ) -> Track | None:
@@ -252,7 +214,8 @@ class FrontEnd:
         """
         if found is None:
             motion = self.motion
-            is_possible = partial(motion.is_heading_possible, stamp_ns=stamp_ns)
+            expected = motion.expected(stamp_ns)
+            is_possible = partial(is_near, expected=expected)
             lost_at = motion.T_camera_world if motion.state is TrackingState.LOST_NEAR else None
             lost_at = motion.steady(stamp_ns) if motion.state.is_resuming else lost_at
             found = self.relocaliser.find(images, features, stamp_ns, is_possible, lost_at)
@@ -324,7 +287,7 @@ def _with_prior(
     seen = seen.with_noise_factor(by_images.noise_factor)
     seen = with_patch_noise(images.left, seen, not images.depth_scale)
     start, camera = by_images.T_camera_world, sparse_map.rig.camera
-    found = refine_pose(camera, start, points, seen, 1.0, prior)
+    found = refine_pose(camera, start, points, seen, prior, is_noise_known=True)
     return replace(by_images, T_camera_world=found.T_camera_world, covariance=found.covariance)
 
 
@@ -338,9 +301,11 @@ def _with_patch_noise(images: Images, observed: ObservedFeatures, track: Track) 
     return replace(observed, observations=noisy)
 
 
-def _recognised(track: Track, ratio: float) -> bool:
-    """Whether a camera that was lost sees enough of what it should see there."""
-    return len(track.point_ids) >= ratio * len(track.visible_ids)
+def is_near(T_camera_world: Array, expected: PoseEstimate | None) -> bool:
+    """Whether a camera can be at a pose (4, 4). expected: where it is, as far as that is known."""
+    return expected is None or not differ(
+        replace(expected, T_camera_world=T_camera_world), expected
+    )
 
 
 def image_fault(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> str:

@@ -12,7 +12,7 @@ from keyframes: errors do not add up from frame to frame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,14 +31,14 @@ from segfloor_ros.core.slam.rig import (
     in_view,
 )
 from segfloor_ros.core.slam.sparse_map import Covisible, SparseMap
-from segfloor_ros.core.slam.thresholds import ENOUGH
+from segfloor_ros.core.slam.tracking.evidence import is_proof
 from segfloor_ros.core.slam.tracking.images import (
     PYRAMID_LEVELS,
     PYRAMID_SCALE,
+    SIDE_PX,
     SIGMA_FLOW_PX,
     Features,
     Images,
-    Matches,
     follow_pixels,
     is_inside,
     match_predicted,
@@ -46,17 +46,12 @@ from segfloor_ros.core.slam.tracking.images import (
     spread,
 )
 from segfloor_ros.core.slam.tracking.patch_alignment import (
+    ALIGNED_PX,
     MIN_SIGMA_PIXEL,
     align_patches,
     measure_disparity,
 )
-from segfloor_ros.core.slam.tracking.pose import (
-    KNOWN_NOISE,
-    Agreement,
-    Consensus,
-    PoseEstimate,
-    solve_pnp,
-)
+from segfloor_ros.core.slam.tracking.pose import Consensus, PoseEstimate, Searched, solve_pnp
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
 
@@ -98,25 +93,35 @@ class Tracker:
         sigma[:, :2] = SIGMA_PIXEL * scale[:, None]
         return Observations(uvd, sigma)
 
-    def track(
+    def best(
         self,
         images: Images,
         features: Features,
         local_ids: NDArray[np.int32],
-        predictions: Sequence[Array],
+        starts: Iterable[Start],
+        expected: PoseEstimate | None,
     ) -> Track | None:
-        """Find the pose of a frame near one of the predicted ones, tried in order; its observations
-        have the disparity offset. None when too few points are found again.
+        """Return the pose of a frame with the most evidence, of those found from some starts, tried
+        in order until one is proven and is where the camera was expected; its observations have the
+        disparity offset. None where nothing is proven.
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
         tree = cKDTree(features.uv_px)
         observations = self.pixel_observations(features)
-        estimate = self._coarse_pose(features, tree, observations, local_ids, predictions)
-        if estimate is None:
-            return None
-        pose = estimate.T_camera_world
-        return self.track_at(images, features, local_ids, pose)
+        best: Track | None = None
+        for start in starts:
+            coarse = self._coarse(features, tree, observations, local_ids, start)
+            if coarse is None:
+                continue
+            track = self.track_at(images, features, local_ids, coarse.T_camera_world)
+            if track is None:
+                continue
+            if best is None or track.evidence(expected) > best.evidence(expected):
+                best = track
+            if best is track and is_proof(track.evidence(expected)) and track.fits(expected):
+                break
+        return best if best is not None and is_proof(best.evidence(expected)) else None
 
     @timed
     def track_at(
@@ -128,9 +133,10 @@ class Tracker:
         known: PoseEstimate | None = None,
         is_given: bool = False,
     ) -> Track | None:
-        """Find which features show map points, and the pose, which is known to a few pixels; as
-        `track` for the rest. known: the pose by the same images before; or, with is_given,
-        where the camera is, and only its points are looked for.
+        """Find which features show map points, and the pose, which is known to a few pixels; its
+        observations have the disparity offset. None where there is no evidence for it. known: the
+        pose by the same images before; or, with is_given, where the camera is, and only its points
+        are looked for.
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
@@ -141,8 +147,8 @@ class Tracker:
             observations, excluded = images, None
         seen = predict_points(self._map, local_ids, T_camera_world, excluded)
         tree = cKDTree(features.uv_px)
-        points, rows = self._search(features, tree, seen, NARROW_PX)
-        if len(rows) < (ENOUGH if known is None else 1):
+        points, rows, area_px2 = self._search(features, tree, seen, NARROW_PX)
+        if len(rows) == 0:
             return None
         ids = seen.ids[points]
         if isinstance(images, Images):
@@ -152,12 +158,13 @@ class Tracker:
         measured = observations.take(rows).without_offset(offset_px)
         found = None
         if not is_given:
-            found = self.consensus.refine(T_camera_world, ids, measured, known=known)
-        if found is None or not found.is_believable():
+            searched = searched_in(area_px2, images, measured)
+            found = self.consensus.refine(T_camera_world, ids, measured, searched, known)
+        if found is None or not is_proof(found.evidence(known)):
             if known is None:
                 return None
             found = self.consensus.at(known, ids, measured)
-        estimate = found.estimate
+        estimate = found
         rows, ids = rows[estimate.inliers], ids[estimate.inliers]
         point_id = np.full(len(features), NO_POINT, np.int32)
         point_id[rows] = ids
@@ -171,65 +178,79 @@ class Tracker:
             ),
         )
 
-    def _coarse_pose(
-        self,
-        features: Features,
-        tree: cKDTree,
-        observations: Observations,
-        local_ids: NDArray[np.int32],
-        predictions: Sequence[Array],
-    ) -> PoseEstimate | None:
-        """Search around the predictions, then wider around the first, then without any."""
-        attempts = [(T, USUAL_PX) for T in predictions] + [(T, WIDE_PX) for T in predictions[:1]]
-        for T_predicted, radius_px in attempts:
-            seen = predict_points(self._map, local_ids, T_predicted)
-            points, rows = self._search(features, tree, seen, radius_px)
-            estimate = self._believable(observations, seen.ids[points], rows, T_predicted)
-            if estimate is not None:
-                return estimate
-        return self.locate(features, tree, observations, local_ids)
-
     def locate(
         self, features: Features, tree: cKDTree, observations: Observations, ids: NDArray[np.int32]
     ) -> PoseEstimate | None:
         """Find the pose among map points without a prediction: descriptors alone and PnP-RANSAC for
         a first guess, which then has to find more points where they should be.
         """
-        points, rows = match_unguided(self._map.descriptor[ids], features.descriptor)
-        found = solve_pnp(
-            self._map.rig.camera, self._map.xyz_world[ids[points]], features.uv_px[rows]
-        )
-        if found is None or found[1].sum() < ENOUGH // 2:
-            return None
-        seen = predict_points(self._map, ids, found[0])
-        points, rows = self._search(features, tree, seen, USUAL_PX)
-        return self._believable(observations, seen.ids[points], rows, found[0])
+        start = self.by_descriptors(features, ids)
+        return None if start is None else self._coarse(features, tree, observations, ids, start)
 
-    def _believable(
+    def by_descriptors(self, features: Features, ids: NDArray[np.int32]) -> Start | None:
+        """Return the pose that most of the map points `ids` (N,) agree with whose descriptors are
+        each other's nearest with those of features.
+        """
+        points, rows = match_unguided(self._map.descriptor[ids], features.descriptor)
+        xyz_world = self._map.xyz_world[ids[points]]
+        found = solve_pnp(self._map.rig.camera, xyz_world, features.uv_px[rows])
+        return None if found is None else Start(found[0])
+
+    def _coarse(
         self,
+        features: Features,
+        tree: cKDTree,
         observations: Observations,
-        ids: NDArray[np.int32],
-        rows: NDArray[np.intp],
-        T_start: Array,
+        local_ids: NDArray[np.int32],
+        start: Start,
     ) -> PoseEstimate | None:
-        """Refine a pose; None unless enough matches agree with it, and not as a small minority."""
-        if len(rows) < ENOUGH:
+        """Return the pose by the features around a start; None where there is no evidence."""
+        seen = predict_points(self._map, local_ids, start.T_camera_world)
+        points, rows, area_px2 = self._search(features, tree, seen, start.radius_px)
+        if len(rows) == 0:
             return None
-        found = self.consensus.refine(T_start, ids, observations.take(rows), KNOWN_NOISE)
-        return found.estimate if found.is_believable() else None
+        found = self.consensus.refine(
+            start.T_camera_world, seen.ids[points], observations.take(rows), Searched(area_px2)
+        )
+        return found if is_proof(found.evidence()) else None
 
     def _search(
         self, features: Features, tree: cKDTree, seen: Prediction, radius_px: float
-    ) -> Matches:
-        scale = PYRAMID_SCALE ** np.clip(seen.octave, 0, None)
-        return match_predicted(
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+        """Return pairs of points (N,) and features (N,) and the areas (N,) they were looked for
+        in.
+        """
+        reach_px = radius_px * PYRAMID_SCALE ** np.clip(seen.octave, 0, None)
+        points, rows = match_predicted(
             features,
             tree,
             seen.uvd_px[:, :2],
             seen.octave,
             self._map.descriptor[seen.ids],
-            radius_px * scale,
+            reach_px,
         )
+        return points, rows, np.pi * reach_px[points] ** 2
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the camera may be, T_camera_world (4, 4), and how far from there points are looked for
+    at the finest level of the pyramid.
+    """
+
+    T_camera_world: Array
+    radius_px: float = USUAL_PX
+
+
+def searched_in(area_px2: Array | float, images: Pixels, measured: Observations) -> Searched:
+    """Return where points were looked for: disparities near a guess, but of a depth camera it takes
+    those that come.
+    """
+    range_px = 2 * ALIGNED_PX
+    disparity = measured.uvd_px[measured.has_disparity, 2]
+    if len(disparity) and not (isinstance(images, Images) and not images.depth_scale):
+        range_px = max(range_px, float(np.ptp(disparity)))
+    return Searched(area_px2, range_px)
 
 
 @dataclass(frozen=True)
@@ -405,44 +426,43 @@ class Follower:
         roughly = self._by_flow(images, T_predicted)
         if roughly is None:
             return None
-        pose = roughly.estimate.T_camera_world
+        pose = roughly.T_camera_world
         seen = self._select(local_ids, pose, images.excluded)
         observations = Observations(seen.uvd_px.copy(), np.ones((len(seen.ids), 3)))
         rows = np.arange(len(seen.ids))
         rows = rows[align_pixels(images.left, observations, rows, self._map, seen.ids, pose)]
         measure_disparity(images, observations, rows, seen.uvd_px[rows, 2] + offset_px)
-        if len(rows) < ENOUGH:
+        if len(rows) == 0:
             return None
         ids = seen.ids[rows]
         measured = observations.take(rows)
-        found = self._consensus.refine(pose, ids, measured.without_offset(offset_px))
-        if not found.is_believable(len(seen.ids)):
-            return None
-        estimate = found.estimate
-        return Track(estimate, ids[estimate.inliers], measured.take(estimate.inliers), seen.ids)
+        searched = searched_in(4 * ALIGNED_PX**2, images, measured)
+        found = self._consensus.refine(pose, ids, measured.without_offset(offset_px), searched)
+        return Track(found, ids[found.inliers], measured.take(found.inliers), seen.ids)
 
     @timed
-    def _by_flow(self, images: Images, T_predicted: Array) -> Agreement | None:
+    def _by_flow(self, images: Images, T_predicted: Array) -> PoseEstimate | None:
         """Find the pose to about a pixel from where the last frame's points went."""
-        if self._small is None or len(self._ids) < ENOUGH:
+        if self._small is None or len(self._ids) == 0:
             return None
         step = -(-len(self._ids) // MAX_FOLLOWED)
         ids, uv_last = self._ids[::step], self._uv_px[::step]
         points = transform_points(T_predicted, self._map.xyz_world[ids])
         front = points[:, 2] > MIN_DEPTH_M
         ids, uv_last, points = ids[front], uv_last[front], points[front]
-        if len(ids) < ENOUGH:
+        if len(ids) == 0:
             return None
         guess = self._camera.project(points)[:, :2]
         width = self._camera.width
         uv, found = follow_pixels(self._small, images.small, width, uv_last, guess)
         found &= ~is_inside(images.excluded, uv)
-        if found.sum() < ENOUGH:
+        if not found.any():
             return None
         uvd = np.column_stack([uv[found], np.full(int(found.sum()), np.nan)])
         observations = Observations(uvd, np.full(uvd.shape, SIGMA_FLOW_PX))
-        agreement = self._consensus.refine(T_predicted, ids[found], observations)
-        return agreement if agreement.is_believable(len(ids)) else None
+        searched = Searched(float(SIDE_PX * width / self._small.shape[1]) ** 2)
+        roughly = self._consensus.refine(T_predicted, ids[found], observations, searched)
+        return roughly if is_proof(roughly.evidence()) else None
 
     @timed
     def _select(

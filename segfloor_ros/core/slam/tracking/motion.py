@@ -16,21 +16,11 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import BodySensors, LastPose, RelativeMotion
-from segfloor_ros.core.geometry import (
-    Array,
-    invert,
-    make_transform,
-    rotation_angle,
-    rotation_from_angles,
-)
-from segfloor_ros.core.slam.rig import is_gated
+from segfloor_ros.core.geometry import Array, invert, make_transform, rotation_from_angles
 from segfloor_ros.core.slam.thresholds import SAME, SPEED_SIGMA
 from segfloor_ros.core.slam.tracking.images import SMALL_WIDTH_PX
-from segfloor_ros.core.slam.tracking.pose import PoseEstimate
-from segfloor_ros.core.twists import adjoint, is_within, se3_exp, se3_log, without_drift
-
-MAX_TURN_RADPS = 6.0
-"""A robot does not spin faster than once a second."""
+from segfloor_ros.core.slam.tracking.pose import ANYWHERE, PoseEstimate
+from segfloor_ros.core.twists import adjoint, se3_exp, se3_log, without_drift
 
 MIN_STEP_S = 1e-3
 
@@ -38,7 +28,12 @@ MIN_RESPONSE = 0.05
 """Of the phase correlation of two images that have something in common."""
 
 ACCELERATION = 2.0
-"""Of a robot on wheels, m/s² and rad/s²."""
+"""Of a robot on wheels, m/s² and rad/s², until its motion shows another one."""
+
+LEARNT_FROM, LARGEST = 30, 10.0
+"""Frames that count for how a motion goes on, and by how many times one surprise may exceed what is
+known.
+"""
 
 
 class TrackingState(Enum):
@@ -79,9 +74,8 @@ class CameraMotion:
     while it is lost, `T_camera_world` turns on as a gyroscope measures.
     """
 
-    def __init__(self, max_speed_mps: float, body: BodySensors) -> None:
+    def __init__(self, body: BodySensors) -> None:
         self._body = body
-        self._max_speed_mps = max_speed_mps
         self.reset()
 
     def reset(self) -> None:
@@ -92,6 +86,7 @@ class CameraMotion:
         self.state = TrackingState.TRACKING
         self._velocity: Array = np.zeros(6)
         self._last_stamp_ns = 0
+        self._surprises = Surprises()
         self._heading_sigma_rad: float | None = None
         self.since_keyframe = KeyframeMotion(self.T_camera_world, self.covariance)
         self._latest: tuple[tuple[int, int], RelativeMotion | None] | None = None
@@ -109,7 +104,7 @@ class CameraMotion:
         """
         measured = self.measured(stamp_ns)
         pose = self.since_keyframe.moved(measured) if measured and measured.by_wheels else None
-        return None if pose is None else PoseEstimate(pose[0], np.zeros(0, bool), pose[1], 1.0)
+        return None if pose is None else _estimate(*pose)
 
     def predict(self, stamp_ns: int) -> Array:
         """Return where the camera will be, T_camera_world (4, 4)."""
@@ -130,38 +125,31 @@ class CameraMotion:
             se3_exp(self._velocity * _step_s(self._last_stamp_ns, stamp_ns)) @ self.T_camera_world
         )
 
-    def expected(self, stamp_ns: int) -> PoseEstimate:
-        """Return where the camera will be if its motion goes on, as far as that of a robot does."""
-        sigma = 0.5 * _step_s(self._last_stamp_ns, stamp_ns) ** 2 * ACCELERATION
-        covariance = self.covariance + np.diag(np.repeat(sigma**2, 6))
-        return PoseEstimate(self.predict(stamp_ns), np.zeros(0, bool), covariance, 1.0)
-
-    def is_plausible(self, T_camera_world: Array, stamp_ns: int) -> bool:
-        """Whether a robot can have come to a pose since the last frame."""
-        motion = T_camera_world @ invert(self.T_camera_world)
-        step_s = _step_s(self._last_stamp_ns, stamp_ns)
-        return is_within(motion, (self._max_speed_mps * step_s, MAX_TURN_RADPS * step_s))
-
-    def is_consistent(self, T_camera_world: Array, covariance: Array, stamp_ns: int) -> bool:
-        """Whether a pose that the images show, with its covariance (6, 6), fits what the sensors
-        measure.
+    def expected(self, stamp_ns: int) -> PoseEstimate | None:
+        """Return where the camera will be: as wheels or an IMU measure, or if its motion goes on,
+        as far as it did so far; of a lost one by the gyroscope's turn. None where nothing is known.
         """
+        step_s = _step_s(self._last_stamp_ns, stamp_ns)
+        if self.state.is_lost:
+            return self._expected_lost(stamp_ns)
         measured = self.measured(stamp_ns)
-        prior = self._predicted(measured)
-        if measured is None or prior is None:
-            return True
-        error, P = se3_log(T_camera_world @ invert(prior[0])), prior[1] + covariance
+        predicted = self._predicted(measured)
+        if measured is None or predicted is None:
+            goes_on = self.covariance + self._surprises.covariance(step_s)
+            return _estimate(self.predict(stamp_ns), goes_on)
+        pose, covariance = predicted[0], predicted[1].copy()
         if not measured.by_wheels:
-            P[:3, :3] += (SPEED_SIGMA * _step_s(self._last_stamp_ns, stamp_ns)) ** 2 * np.eye(3)
-        return is_gated(error, P)
+            covariance[:3, :3] += (SPEED_SIGMA * step_s) ** 2 * np.eye(3)
+        return _estimate(pose, covariance)
 
-    def is_heading_possible(self, T_camera_world: Array, stamp_ns: int) -> bool:
-        """Whether a camera that was lost may have turned to a pose since."""
+    def _expected_lost(self, stamp_ns: int) -> PoseEstimate | None:
         turned = self._turned(stamp_ns)
         if turned is None or self._heading_sigma_rad is None:
-            return True
-        off_rad = rotation_angle(T_camera_world[:3, :3] @ turned[0][:3, :3].T)
-        return off_rad < SAME[1] + 3 * (self._heading_sigma_rad + turned[1])
+            return None
+        sigma_rad = self._heading_sigma_rad + turned[1] + SAME[1] / 3
+        covariance = ANYWHERE.copy()
+        covariance[3:, 3:] = sigma_rad**2 * np.eye(3)
+        return _estimate(turned[0], covariance)
 
     def last_pose(self) -> LastPose:
         """Return what a drive that is broken off here goes on from."""
@@ -201,6 +189,9 @@ class CameraMotion:
             self.T_world_odom = without_drift(invert(T_camera_world) @ invert(T_odom_camera))
         motion = se3_log(T_camera_world @ invert(self.T_camera_world))
         steady = not (self.state.is_lost or self.state.is_blind)
+        if steady and self._velocity.any():
+            step_s = _step_s(self._last_stamp_ns, stamp_ns)
+            self._surprises.learn(motion - self._velocity * step_s, step_s)
         self._velocity = motion / _step_s(self._last_stamp_ns, stamp_ns) if steady else np.zeros(6)
         self.since_keyframe.add(measured)
         self.T_camera_world, self.covariance = T_camera_world, covariance
@@ -295,6 +286,24 @@ class CameraMotion:
         return _moved((self.T_camera_world, covariance), measured)
 
 
+class Surprises:
+    """How far motions went on otherwise than they did, in m/s² and rad/s², as the drive shows."""
+
+    def __init__(self) -> None:
+        self._squares = np.full(2, ACCELERATION**2)
+        self._count = LEARNT_FROM / 3
+
+    def learn(self, error: Array, step_s: float) -> None:
+        """Take in the error (6,) of a motion that was expected to go on."""
+        seen = (error.reshape(2, 3) ** 2).mean(axis=1) / step_s**4
+        self._count = min(self._count + 1, LEARNT_FROM)
+        self._squares += (np.minimum(seen, LARGEST * self._squares) - self._squares) / self._count
+
+    def covariance(self, step_s: float) -> Array:
+        """Return the covariance (6, 6) of a motion that goes on."""
+        return np.diag(np.repeat(self._squares * step_s**4, 3))
+
+
 class KeyframeMotion:
     """The motion since the last keyframe as sensors measure it, None where they did not.
 
@@ -336,6 +345,10 @@ def _moved(before: tuple[Array, Array], motion: RelativeMotion) -> tuple[Array, 
     """Return a pose (4, 4) and its covariance (6, 6) after a motion."""
     A = adjoint(motion.T_now_before)
     return motion.T_now_before @ before[0], A @ before[1] @ A.T + motion.covariance
+
+
+def _estimate(T_camera_world: Array, covariance: Array) -> PoseEstimate:
+    return PoseEstimate(T_camera_world, np.zeros(0, bool), covariance, 1.0)
 
 
 def _step_s(before_ns: int, now_ns: int) -> float:

@@ -21,6 +21,7 @@ from segfloor_ros.core.contracts import UNKNOWN_COVARIANCE
 from segfloor_ros.core.geometry import Array, invert, make_transform, transform_points
 from segfloor_ros.core.least_squares import SHRINK, minimise
 from segfloor_ros.core.slam.rig import (
+    MAX_DISPARITY_SHARE,
     MIN_DEPTH_M,
     SAME_PX,
     SMALLEST,
@@ -32,7 +33,14 @@ from segfloor_ros.core.slam.rig import (
     squared_norms,
 )
 from segfloor_ros.core.slam.sparse_map import SparseMap
-from segfloor_ros.core.slam.thresholds import ENOUGH, MAJORITY, PROOF
+from segfloor_ros.core.slam.thresholds import PROOF
+from segfloor_ros.core.slam.tracking.evidence import (
+    Mixture,
+    gained,
+    is_proof,
+    log_chance_of,
+    surprise,
+)
 from segfloor_ros.core.timing import timed
 from segfloor_ros.core.twists import se3_exp, se3_log
 
@@ -45,10 +53,12 @@ CONVERGED = 1e-4
 SAME_INLIERS = 0.01
 """Share of the points that changes sides below which another round would change nothing."""
 
-MAX_NOISE_FACTOR = 4.0
 RANSAC_ITERATIONS = 600
 """Where a quarter of the matches are right, nine times in ten four right ones are drawn in so many;
 it ends early when more are right."""
+
+ANYWHERE = np.diag(np.array([3.0] * 3 + [1.0] * 3) ** 2)
+"""Covariance of where the camera may be in view of some points, m² and rad²."""
 
 FIRST_INFORMATION = np.array([1.0] * 3 + [0.1] * 3) ** -2
 """Of a pose before any point is seen, in metres and radians: where no point determines it."""
@@ -57,15 +67,36 @@ FLOOR_M = 0.05
 """What is no higher belongs to the floor, which stands still whenever it was first seen, and whose
 disparities repeat and mirror."""
 
-USUAL_SHARE, USUAL_NOISE = 0.8, 1.2
-"""Where at least this share of what has a record fits, at no more than this noise, all is well."""
+USUAL_SHARE = 0.8
+"""Where at least this share of what has a record fits, all is well: to look for a second motion
+costs as much as the pose."""
 
-MIN_FOUND = 0.15
-"""Share of the points that should be in view that must be found and agree: far points alone fit
-many places."""
+PROVEN = math.log(PROOF)
+"""Record of what is taken to stand still."""
 
-KNOWN_NOISE = 2.0
-"""Corners of an image are worse by no more than this factor than patches of the same image."""
+
+@dataclass(frozen=True)
+class Searched:
+    """Where matches were looked for. area_px2: (N,) or one for all. range_px: of disparities.
+    None: the whole image.
+    """
+
+    area_px2: Array | float | None = None
+    range_px: float | None = None
+
+    def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Searched:
+        """Return that of the chosen matches."""
+        area = self.area_px2
+        return replace(self, area_px2=area[rows]) if isinstance(area, np.ndarray) else self
+
+    def log_chance(self, camera: StereoCamera, observations: Observations) -> Array:
+        """Return the logarithm (N,) of where a wrong match may lie over where a right one may."""
+        area = camera.width * camera.height if self.area_px2 is None else self.area_px2
+        range_px = MAX_DISPARITY_SHARE * camera.width if self.range_px is None else self.range_px
+        return log_chance_of(observations, area, range_px)
+
+
+WHOLE = Searched()
 
 
 @dataclass(frozen=True)
@@ -74,12 +105,25 @@ class PoseEstimate:
 
     T_camera_world: (4, 4). inliers: (N,) bool over the observations. covariance: (6, 6) of the
     twist in T_camera_world <- exp(twist) T_camera_world, order translation (m), rotation (rad).
+    log_ratio: of the likelihood of the observations over that of chance (see `evidence`).
     """
 
     T_camera_world: Array
     inliers: NDArray[np.bool_]
     covariance: Array
     noise_factor: float
+    log_ratio: float = 0.0
+
+    def evidence(self, expected: PoseEstimate | None = None) -> float:
+        """Return how much the observations say for the pose. expected: where the camera was to be;
+        without it, anywhere within some metres.
+        """
+        information = np.linalg.inv(self.covariance)
+        if expected is None:
+            return self.log_ratio - gained(information, ANYWHERE)
+        error = se3_log(self.T_camera_world @ invert(expected.T_camera_world))
+        of_prior = surprise(error, expected.covariance + self.covariance)
+        return self.log_ratio - gained(information, expected.covariance) - of_prior
 
 
 def solve_pnp(
@@ -116,30 +160,35 @@ def refine_pose(
     T_camera_world: Array,
     points_world: Array,
     observations: Observations,
-    max_noise_factor: float = MAX_NOISE_FACTOR,
     prior: PoseEstimate | None = None,
+    searched: Searched = WHOLE,
+    is_noise_known: bool = False,
 ) -> PoseEstimate:
     """Refine a pose by Levenberg-Marquardt on (u, v, d) with a Huber cost, dropping outliers
     between rounds.
 
     points_world: (N, 3). Points that fall behind the camera count as outliers. Blur, compression
-    and a poor calibration make errors larger than the sigmas of single measurements; the median
-    residual shows by how much, and the bound on outliers follows it. prior: the pose by other
-    sensors; it adds what the points do not determine.
+    and a poor calibration make errors larger than the sigmas of single measurements; a mixture of
+    right and wrong matches shows by how much, and the bound on outliers follows it, unless the
+    noise is known. prior: the pose by other sensors; it adds what the points do not determine.
+    searched: where the matches were looked for.
     """
     seen = _Seen.of(camera, points_world, observations)
     inliers = np.ones(len(points_world), bool)
     if prior is not None and not len(points_world):
         return replace(prior, inliers=inliers)
     known = _Prior() if prior is None else _Prior.of(prior)
+    log_chance = searched.log_chance(camera, observations)
+    mixture: Mixture | None = None
     pose, factor = T_camera_world, 1.0
     for _ in range(ROUNDS):
         state = _State(pose, seen.take(inliers), known)
         pose = minimise(state, STEPS_PER_ROUND, CONVERGED).pose
         rays, _, chi2 = seen.at(pose)
-        chi2[rays[2] >= 1 / MIN_DEPTH_M] = np.inf
-        middle = float(np.median(chi2 / seen.median))
-        factor = math.sqrt(min(max(middle, 1.0), max_noise_factor**2))
+        chi2[rays[2] >= 1 / MIN_DEPTH_M] = 1e12
+        start = 1.0 if is_noise_known else math.sqrt(max(1.0, float(np.median(chi2 / seen.median))))
+        mixture = Mixture.fit(chi2, seen.dimensions, log_chance, start)
+        factor = 1.0 if is_noise_known else mixture.factor
         before, inliers = inliers, chi2 <= factor**2 * seen.limit
         is_enough = prior is not None or inliers.sum() >= 4
         if not is_enough or (inliers != before).mean() < SAME_INLIERS:
@@ -148,8 +197,9 @@ def refine_pose(
         return PoseEstimate(pose, inliers, np.eye(6) * UNKNOWN_COVARIANCE, factor)
     # Huber's weight of an inlier is 1.
     J = seen.take(inliers).jacobian(rays[:, inliers], 1 / factor)
-    covariance = np.linalg.pinv(J @ J.T + known.information, hermitian=True)
-    return PoseEstimate(pose, inliers, covariance, factor)
+    covariance = np.linalg.inv(J @ J.T + known.information + np.eye(6) / UNKNOWN_COVARIANCE)
+    assert mixture is not None
+    return PoseEstimate(pose, inliers, covariance, factor, mixture.log_ratio)
 
 
 @dataclass(frozen=True)
@@ -223,6 +273,11 @@ class _Seen:
     def median(self) -> Array:
         """What chi2 (N,) is in the median, when all is well."""
         return self.rows[10]
+
+    @property
+    def dimensions(self) -> Array:
+        """How many coordinates of each were measured (N,)."""
+        return np.asarray((self.rows[3:6] > 0).sum(axis=0), np.float64)
 
     def take(self, columns: NDArray[np.bool_]) -> _Seen:
         """Return the chosen ones."""
@@ -305,31 +360,6 @@ def knows_more(prior: PoseEstimate, fused: PoseEstimate) -> bool:
     return bool(np.linalg.eigvals(np.linalg.solve(by_points, known)).real.max() > 1)
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """A pose and the points that count for it: (N,) bool, all but those of another motion."""
-
-    estimate: PoseEstimate
-    counted: NDArray[np.bool_]
-
-    @property
-    def agreeing(self) -> int:
-        """How many points agree with the pose."""
-        return int(self.estimate.inliers.sum())
-
-    @property
-    def share(self) -> float:
-        """The share of the points that count which agree."""
-        return self.agreeing / max(1, int(self.counted.sum()))
-
-    def is_believable(self, looked_for: int = 0) -> bool:
-        """Whether enough points agree, also of those that were looked for, and most of those that
-        count: a wrong pose has followers too.
-        """
-        enough = max(ENOUGH, MIN_FOUND * looked_for)
-        return self.agreeing >= enough and self.share >= MAJORITY
-
-
 class Consensus:
     """Finds poses from matched points of a map."""
 
@@ -343,103 +373,83 @@ class Consensus:
         T_start: Array,
         ids: NDArray[np.int32],
         observations: Observations,
-        max_noise_factor: float = MAX_NOISE_FACTOR,
+        searched: Searched = WHOLE,
         known: PoseEstimate | None = None,
-    ) -> Agreement:
-        """Refine a pose by points `ids` (N,) and their observations (N). known: the pose of the
-        same image by other measurements.
+    ) -> PoseEstimate:
+        """Refine a pose by points `ids` (N,) and their observations (N). searched: where they were
+        looked for. known: the pose of the same image by other measurements.
         """
         points = self._map.xyz_world[ids]
-        if known is not None:
-            max_noise_factor = min(max_noise_factor, KNOWN_NOISE * known.noise_factor)
-        of_most = refine_pose(self._camera, T_start, points, observations, max_noise_factor)
-        problem = _Problem(self._camera, points, observations, of_most)
+        problem = _Problem(self._camera, points, observations, searched)
+        of_most = problem.refined(T_start)
         if known is not None and differ(of_most, known):
-            return problem.near(known.T_camera_world, max_noise_factor)
-        proven = self.proven(ids, T_start)
-        if proven.sum() < ENOUGH // 2 or _fits(of_most, proven):
-            return problem.of_everyone()
-        measured = observations.take(proven)
-        of_proven = refine_pose(self._camera, T_start, points[proven], measured, max_noise_factor)
-        found = None
-        if differ(of_most, of_proven):
-            found = problem.choose(of_proven.T_camera_world, of_proven.noise_factor, proven)
-        return problem.of_everyone() if found is None else found
+            return problem.near(known.T_camera_world, known.noise_factor)
+        record = self.record(ids, T_start)
+        proven = record >= PROVEN
+        if not proven.any() or of_most.inliers[proven].mean() > USUAL_SHARE:
+            return of_most
+        of_proven = problem.take(proven).refined(T_start)
+        if not differ(of_most, of_proven):
+            return of_most
+        before = problem.fitting(of_most.T_camera_world, of_proven.noise_factor)
+        after = problem.fitting(of_proven.T_camera_world, of_proven.noise_factor)
+        # One of the two stands still, and each of its points had the record of what does.
+        if not is_proof(record @ (after.astype(float) - before)):
+            return of_most
+        return problem.near(of_proven.T_camera_world, of_proven.noise_factor)
 
     def at(
         self, known: PoseEstimate, ids: NDArray[np.int32], observations: Observations
-    ) -> Agreement:
+    ) -> PoseEstimate:
         """Return a pose as it is, and which of points `ids` (N,) fit it, be they ever so few."""
-        problem = _Problem(self._camera, self._map.xyz_world[ids], observations, known)
-        fitting = problem.fitting(known.T_camera_world, KNOWN_NOISE * known.noise_factor)
-        return Agreement(replace(known, inliers=fitting), fitting)
+        problem = _Problem(self._camera, self._map.xyz_world[ids], observations, WHOLE)
+        return replace(known, inliers=problem.fitting(known.T_camera_world, known.noise_factor))
 
-    def proven(self, ids: NDArray[np.int32], T_camera_world: Array) -> NDArray[np.bool_]:
-        """Return which points (N,) have a record of standing still, or belong to the floor."""
-        proven = self._map.observer_count[ids] >= PROOF
+    def record(self, ids: NDArray[np.int32], T_camera_world: Array) -> Array:
+        """Return the logarithm (N,) of the odds that points stand still: what n keyframes saw at
+        the same place does with n to 1, and what is on the floor stands whenever it was first seen.
+        """
+        count = np.maximum(self._map.observer_count[ids], 1).astype(np.float64)
         if self._map.rig.mount is not None:
             points = transform_points(T_camera_world, self._map.xyz_world[ids])
-            proven |= np.abs(self._map.rig.mount.heights_m(points)) < FLOOR_M
-        return proven
+            on_floor = np.abs(self._map.rig.mount.heights_m(points)) < FLOOR_M
+            count[on_floor] = np.maximum(count[on_floor], PROOF)
+        return np.log(count)
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """Points (N, 3), their observations (N), and the pose that most of them fit."""
+    """Points (N, 3), their observations (N), and where these were looked for."""
 
     camera: StereoCamera
     points: Array
     observations: Observations
-    of_most: PoseEstimate
+    searched: Searched
 
-    def of_everyone(self) -> Agreement:
-        """Return the majority's pose."""
-        return Agreement(self.of_most, np.ones(len(self.points), bool))
-
-    def choose(
-        self, T_other: Array, noise_factor: float, witnesses: NDArray[np.bool_]
-    ) -> Agreement | None:
-        """Return the other motion, refined by all that fits it; None unless most of its witnesses
-        (N,) fit it, and do not fit the majority's.
-        """
-        before = self.fitting(self.of_most.T_camera_world, noise_factor)
-        after = self.fitting(T_other, noise_factor)
-        enough = max(ENOUGH // 2, MAJORITY * witnesses.sum())
-        support = (after & witnesses).sum()
-        if support < enough or (before & witnesses).sum() > MAJORITY * support:
-            return None
-        found = self.near(T_other, noise_factor)
-        return replace(found, counted=found.counted | witnesses)
-
-    def near(self, T_camera_world: Array, noise_factor: float) -> Agreement:
-        """Return a pose refined by what fits it; nothing else counts. With too few points none
-        agrees.
-        """
-        near = self.fitting(T_camera_world, noise_factor)
-        if near.sum() < ENOUGH // 2:
-            nobody = np.zeros(len(self.points), bool)
-            return Agreement(replace(self.of_most, inliers=nobody), near)
-        estimate = refine_pose(
-            self.camera,
-            T_camera_world,
-            self.points[near],
-            self.observations.take(near),
-            noise_factor,
+    def take(self, rows: NDArray[np.bool_]) -> _Problem:
+        """Return the chosen ones."""
+        return _Problem(
+            self.camera, self.points[rows], self.observations.take(rows), self.searched.take(rows)
         )
+
+    def refined(self, T_start: Array) -> PoseEstimate:
+        """Return the pose that most agree with."""
+        return refine_pose(
+            self.camera, T_start, self.points, self.observations, searched=self.searched
+        )
+
+    def near(self, T_camera_world: Array, noise_factor: float) -> PoseEstimate:
+        """Return a pose refined by what fits it; what does not is of something else, or wrong."""
+        near = self.fitting(T_camera_world, noise_factor)
+        found = self.take(near).refined(T_camera_world)
         inliers = np.zeros(len(self.points), bool)
-        inliers[near] = estimate.inliers
-        return Agreement(replace(estimate, inliers=inliers), near)
+        inliers[near] = found.inliers
+        return replace(found, inliers=inliers)
 
     def fitting(self, T_camera_world: Array, noise_factor: float) -> NDArray[np.bool_]:
         """Return which observations (N,) fit a pose."""
         chi2 = squared_distances(self.camera, T_camera_world, self.points, self.observations)
         return np.asarray(chi2 <= noise_factor**2 * self.observations.chi2_limit)
-
-
-def _fits(estimate: PoseEstimate, proven: NDArray[np.bool_]) -> bool:
-    """Whether nothing hints at a second motion; to look for one costs as much as the pose."""
-    fitting = bool(estimate.inliers[proven].mean() > USUAL_SHARE)
-    return fitting and estimate.noise_factor < USUAL_NOISE
 
 
 def differ(a: PoseEstimate, b: PoseEstimate) -> bool:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.tracking.images import Features
-from segfloor_ros.core.slam.tracking.pose import PoseEstimate
+from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Track:
 
     point_ids: (N,) the map points that were found and agree, and observations (N) of them as
     measured. visible_ids: those that were looked for. observed: set when the pose was found by
-    features. is_poor: whether few points of many support the pose. sigma_m: how uncertain the image
+    features. sigma_m: how uncertain the image
     leaves the place on the axis where it is most, 0 where it shows plenty. prior: the pose that
     wheels measured, where the image does not contradict it; is_prior_better: in some direction.
     """
@@ -46,7 +46,6 @@ class Track:
     observations: Observations
     visible_ids: NDArray[np.int32]
     observed: ObservedFeatures | None = None
-    is_poor: bool = False
     sigma_m: float = 0.0
     prior: PoseEstimate | None = None
     is_prior_better: bool = False
@@ -65,3 +64,11 @@ class Track:
     def covariance(self) -> Array:
         """The covariance (6, 6) of the pose's twist."""
         return self.estimate.covariance
+
+    def evidence(self, expected: PoseEstimate | None) -> float:
+        """Return the evidence for the pose. expected: where the camera was to be."""
+        return self.estimate.evidence(expected)
+
+    def fits(self, expected: PoseEstimate | None) -> bool:
+        """Whether the camera is where it was expected."""
+        return expected is None or not differ(self.estimate, expected)

@@ -1,0 +1,97 @@
+"""How much measurements say for a pose, against chance.
+
+A match is right with some probability, and then errs by the noise, or it is wrong, and then lies
+anywhere in the area that was searched. The logarithm of the likelihood ratio of the two, summed
+over all matches and averaged over where the camera may be before it looks (Laplace's
+approximation: MacKay, Information Theory, Inference, and Learning Algorithms, 2003, chapters 22 and
+28), is the evidence for a pose. Where all matches are wrong, its exponential is 1 on average,
+whatever pose is tried; so it exceeds 1 / p with a probability of at most p (Markov's inequality).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.slam.rig import GATE, Observations
+
+ENOUGH_EVIDENCE = math.log(GATE / (1.0 - GATE))
+"""Of a pose that is right with a probability of 99.9 %, where right and wrong are as likely before
+anything is seen."""
+
+ROUNDS = 4
+"""Of the estimate of noise and share of the right matches; it settles by a factor of three each."""
+
+KNOWN_AS = 20.0
+"""Measurements that what is known of the noise before counts as."""
+
+TAIL = 3.0
+"""Degrees of freedom of a motion that is expected: large surprises happen (Student's t)."""
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Right and wrong matches. factor: of the noise. share: of right ones. probability: (N,) that
+    each is right. log_ratio: the sum of the logarithms of likelihood over that of chance.
+    """
+
+    factor: float
+    share: float
+    probability: Array
+    log_ratio: float
+
+    @staticmethod
+    def fit(chi2: Array, dimensions: Array, log_chance: Array, factor: float) -> Mixture:
+        """Return the likeliest mixture (expectation maximisation: Dempster et al. 1977).
+
+        chi2: (N,) squared residuals over what the noise is announced to be. dimensions: (N,) of
+        each. log_chance: (N,) logarithm of the area that was searched over that of the noise.
+        factor: of the noise, to begin with.
+        """
+        share, known = 0.5, KNOWN_AS
+        for _ in range(ROUNDS):
+            log_right = log_chance - dimensions * math.log(factor) - chi2 / (2 * factor**2)
+            right = share * np.exp(np.minimum(log_right, 700.0))
+            probability = right / (1.0 - share + right)
+            share = float((probability.sum() + 0.5) / (len(chi2) + 1.0))
+            total = float(probability @ np.where(probability > 0, chi2, 0.0))
+            variance = (known + total) / (known + float(probability @ dimensions))
+            factor = math.sqrt(max(variance, 1.0))
+        log_right = log_chance - dimensions * math.log(factor) - chi2 / (2 * factor**2)
+        right = share * np.exp(np.minimum(log_right, 700.0))
+        log_ratio = float(np.log(1.0 - share + right).sum())
+        return Mixture(factor, share, right / (1.0 - share + right), log_ratio)
+
+
+def log_chance_of(observations: Observations, area_px2: Array | float, range_px: float) -> Array:
+    """Return the logarithm (N,) of the area, and range of disparities, in which a wrong match may
+    lie, over the density of the noise at its peak.
+    """
+    measured = np.isfinite(observations.uvd_px)
+    spread = np.where(measured, observations.sigma_px * math.sqrt(2 * math.pi), 1.0)
+    of_range = np.where(measured[:, 2], math.log(range_px), 0.0)
+    log_chance: Array = np.log(area_px2) + of_range - np.log(spread).sum(axis=1)
+    return log_chance
+
+
+def gained(information: Array, prior_covariance: Array) -> float:
+    """Return what information (6, 6) narrows a prior (6, 6) down by, in nats: what a pose that fits
+    is favoured by for being one of many.
+    """
+    _, log_det = np.linalg.slogdet(np.eye(len(information)) + prior_covariance @ information)
+    return 0.5 * float(log_det)
+
+
+def surprise(error: Array, covariance: Array) -> float:
+    """Return by how many nats an error (6,) is less likely than none (Student's t)."""
+    squared = float(error @ np.linalg.solve(covariance, error))
+    return 0.5 * (TAIL + len(error)) * math.log1p(squared / TAIL)
+
+
+def is_proof(evidence: NDArray[np.floating] | float) -> bool:
+    """Whether the evidence for a pose is enough."""
+    return bool(evidence >= ENOUGH_EVIDENCE)
