@@ -4,6 +4,7 @@ black, white, only half delivered, or the same as before.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -158,28 +159,33 @@ class FrontEnd:
         followed = self.follower.follow(images, self.local.point_ids, prediction)
         if followed is not None and not is_proof(followed.evidence(expected)):
             followed = None
-        if followed is not None and followed.fits(expected):
+        reach_px = math.inf if expected is None else self.local.reach_px(expected)
+        if followed is not None and followed.fits(expected) and reach_px < WIDE_PX:
             return followed
         features = self.extractor.extract(frame.left, images.excluded)
-        starts = self._starts(frame, features, followed)
+        starts = self._starts(frame, features, followed, reach_px)
         found = self.tracker.best(images, features, self.local.point_ids, starts, expected)
-        tracks = [track for track in (followed, found) if track is not None]
-        if not tracks and self.motion.state is not TrackingState.TRACKING:
+        found = followed if found is None else found
+        if found is None and self.motion.state is not TrackingState.TRACKING:
             return self._relocalise(images, features, frame.stamp_ns)
-        return max(tracks, key=lambda track: track.evidence(expected), default=None)
+        return found
 
     def _starts(
-        self, frame: StereoFrame, features: Features, followed: Track | None
+        self, frame: StereoFrame, features: Features, followed: Track | None, reach_px: float
     ) -> Iterator[Start]:
-        """Yield where the camera may be, what costs least first."""
+        """Yield where the camera may be, what costs least first. reach_px: up to which points may
+        be elsewhere than expected.
+        """
         predictions = self._predict_poses(frame)
+        if reach_px < WIDE_PX:
+            yield Start(predictions[0], max(reach_px, USUAL_PX), is_sure=True)
         if followed is not None:
-            predictions.insert(0, followed.T_camera_world)
-        yield from (Start(T_camera_world) for T_camera_world in predictions)
-        yield Start(predictions[0], WIDE_PX)
+            yield Start(followed.T_camera_world)
         located = self.tracker.by_descriptors(features, self.local.point_ids)
         if located is not None:
             yield located
+        yield from (Start(T_camera_world) for T_camera_world in predictions)
+        yield Start(predictions[0], WIDE_PX)
 
     def _weighed(self, track: Track, images: Images) -> Track:
         """Return a track with the likeliest pose by images and prior; that of the images where the

@@ -76,6 +76,9 @@ TRACKED_POINTS = 400
 
 MAX_FOLLOWED = 250
 
+SIGMAS = 3.0
+"""Within so many standard deviations lies what is where it was expected."""
+
 
 class Tracker:
     """Finds the pose of frames against the local map."""
@@ -119,7 +122,7 @@ class Tracker:
                 continue
             if best is None or track.evidence(expected) > best.evidence(expected):
                 best = track
-            if best is track and is_proof(track.evidence(expected)) and track.fits(expected):
+            if start.is_sure and is_proof(track.evidence(expected)) and track.fits(expected):
                 break
         return best if best is not None and is_proof(best.evidence(expected)) else None
 
@@ -235,11 +238,12 @@ class Tracker:
 @dataclass(frozen=True)
 class Start:
     """Where the camera may be, T_camera_world (4, 4), and how far from there points are looked for
-    at the finest level of the pyramid.
+    at the finest level of the pyramid. is_sure: whether it must be there.
     """
 
     T_camera_world: Array
     radius_px: float = USUAL_PX
+    is_sure: bool = False
 
 
 def searched_in(area_px2: Array | float, images: Pixels, measured: Observations) -> Searched:
@@ -340,6 +344,12 @@ class LocalMap:
         share = found / max(1, len(track.visible_ids))
         view = View(frames_since, found, num_reliable, novelty, mapper_idle, share, since_ns)
         return is_keyframe(view, self._max_frames)
+
+    def reach_px(self, expected: PoseEstimate) -> float:
+        """Return how far from where they are expected the points around a camera may be, in px."""
+        variance = np.diag(expected.covariance)
+        sigma_rad = np.sqrt(variance[3:].max()) + np.sqrt(variance[:3].max()) / self._depth_m
+        return float(SIGMAS * self._map.rig.camera.fx * sigma_rad)
 
     def is_new_view(self, T_camera_world: Array) -> bool:
         """Whether a camera that sees no point has come to where the last keyframe was not."""

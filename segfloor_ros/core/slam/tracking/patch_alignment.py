@@ -60,6 +60,9 @@ ALIASED = 0.3
 CELLS, PER_CELL = 80, 3
 """Parts into which an image is divided, and points of each that count: neighbours err together."""
 
+LEAST_ENERGY = 1e-3
+"""Mean square of a slope, in grey levels squared: of an edge, along it; of a plain face."""
+
 LEAST_SHIFT = 1e-4
 """Information in 1/px² of the shift of a pixel along an edge, or on a plain face."""
 
@@ -112,6 +115,7 @@ def align_patches(
         return Alignment(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_))
     fit = _Fit.of(template, axes)
     contrast, of_level = fit.contrast, float(WINDOW.max())
+    known = known_shift(fit.H[::3, ::3])
     warp: Array = np.zeros((2, 3, count))
     warp[0, 0] = warp[1, 1] = zoom
     warp[:, 2] = start_uv_px.T
@@ -140,12 +144,33 @@ def align_patches(
         fit, moving = fit.take(still), moving[still]
     level = np.maximum(noise, GREY_NOISE**2) * of_level
     sigma: Array = np.zeros((2, count))
-    variance = np.einsum('aan->an', inverse)[::3] * level
+    variance = np.maximum(np.einsum('aan->an', inverse)[::3], known) * level
     sigma[:axes] = zoom * np.sqrt(np.maximum(variance, 0.0))
     offset = warp[:, 2] - start_uv_px.T
     sound = (np.abs(offset) < ALIGNED_PX).all(axis=0) & (noise < MAJORITY * contrast)
     sound &= (np.abs(last) < MIN_SIGMA_DISPARITY).all(axis=0)
     return Alignment(start_uv_px + offset.T, sigma.T, sound)
+
+
+def known_shift(energy: Array) -> Array:
+    """Return the variances (axes, N) of the shift of patches of unit noise, by the mean products
+    (axes, axes, N) of their slopes: freed of what noise, and the sampling of an edge, show of slopes
+    that are none.
+    """
+    noise = GREY_NOISE**2 / 2
+    if len(energy) == 1:
+        return np.asarray(1 / np.maximum(energy[0] - noise, LEAST_ENERGY))
+    (a, b), (_, c) = energy
+    middle, half = (a + c) / 2, np.sqrt(((a - c) / 2) ** 2 + b**2)
+    apparent = noise + ALIASED * (middle + half)
+    a, c = a - apparent, c - apparent
+    # A negative eigenvalue becomes none: of a straight edge, the one along it.
+    middle = middle - apparent
+    largest = np.maximum(middle + half, LEAST_ENERGY)
+    smallest = np.maximum(middle - half, LEAST_ENERGY)
+    share = np.clip((a - (middle - half)) / np.maximum(2 * half, 1e-12), 0.0, 1.0)
+    across, along = 1 / largest, 1 / smallest
+    return np.stack([share * across + (1 - share) * along, (1 - share) * across + share * along])
 
 
 @dataclass(frozen=True)
