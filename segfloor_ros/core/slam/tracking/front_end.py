@@ -28,7 +28,14 @@ from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.thresholds import MOST, SAME
 from segfloor_ros.core.slam.tracking.evidence import is_proof
 from segfloor_ros.core.slam.tracking.images import FeatureExtractor, Features, Images, is_inside
-from segfloor_ros.core.slam.tracking.map_tracking import WIDE_PX, Follower, LocalMap, Start, Tracker
+from segfloor_ros.core.slam.tracking.map_tracking import (
+    USUAL_PX,
+    WIDE_PX,
+    Follower,
+    LocalMap,
+    Start,
+    Tracker,
+)
 from segfloor_ros.core.slam.tracking.motion import (
     CameraMotion,
     ImageRotation,
