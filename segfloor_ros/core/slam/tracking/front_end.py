@@ -42,7 +42,7 @@ from segfloor_ros.core.slam.tracking.motion import (
     TrackingState,
     sigma_m,
 )
-from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE, with_patch_noise
+from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ, knows_more, refine_pose
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
@@ -147,7 +147,7 @@ class FrontEnd:
             return None
         track = replace(track, sigma_m=sigma_m(track.covariance))
         T_seen = track.T_camera_world
-        track = self._weighed(replace(track, prior=self.motion.prior(frame.stamp_ns)), images)
+        track = self._weighed(replace(track, prior=self.motion.prior(frame.stamp_ns)))
         self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
         self.follower.see(images, track.point_ids, track.uv_px)
         self.local.move_to(track.point_ids, track.T_camera_world)
@@ -194,14 +194,14 @@ class FrontEnd:
         yield from (Start(T_camera_world) for T_camera_world in predictions)
         yield Start(predictions[0], WIDE_PX)
 
-    def _weighed(self, track: Track, images: Images) -> Track:
+    def _weighed(self, track: Track) -> Track:
         """Return a track with the likeliest pose by images and prior; that of the images where the
         prior contradicts it.
         """
         prior = track.prior
         if prior is None or differ(track.estimate, prior):
             return replace(track, prior=None, is_prior_better=False)
-        fused = _with_prior(self._map, track, images, prior)
+        fused = _with_prior(self._map, track, prior)
         return replace(track, estimate=fused, is_prior_better=knows_more(prior, fused))
 
     def bridge(self, frame: StereoFrame, fault: str) -> None:
@@ -263,7 +263,7 @@ class FrontEnd:
         if track is not None and track.observed is not None:
             inside = is_inside(images.excluded, track.observed.features.uv_px)
             observed = track.observed.take(np.flatnonzero(~inside))
-            return _with_patch_noise(images, observed, track)
+            return observed
         features = self.extractor.extract(frame.left, images.excluded)
         if track is None:
             if not self._map.keyframes:
@@ -277,10 +277,10 @@ class FrontEnd:
         if matched is None:
             return None
         assert matched.observed is not None
-        weighed = self._weighed(replace(matched, prior=track.prior), images)
+        weighed = self._weighed(replace(matched, prior=track.prior))
         self.motion.T_camera_world = weighed.T_camera_world
         self._map.points.note_tracking(matched.visible_ids, matched.point_ids)
-        return _with_patch_noise(images, matched.observed, weighed)
+        return matched.observed
 
     def continue_from(self, images: Images, keyframe: KeyframeRecord) -> None:
         """Track on from the points of a keyframe, old and new."""
@@ -291,27 +291,14 @@ class FrontEnd:
         self.frames_since_keyframe, self.keyframe_ns = 0, keyframe.stamp_ns
 
 
-def _with_prior(
-    sparse_map: SparseMap, track: Track, images: Images, prior: PoseEstimate
-) -> PoseEstimate:
+def _with_prior(sparse_map: SparseMap, track: Track, prior: PoseEstimate) -> PoseEstimate:
     """Return the pose by what a track shows, as sure as its patches are, and a prior."""
     by_images, points = track.estimate, sparse_map.xyz_world[track.point_ids]
     seen = track.observations.without_offset(sparse_map.rig.offset.value_px)
     seen = seen.with_noise_factor(by_images.noise_factor)
-    seen = with_patch_noise(images.left, seen, not images.depth_scale)
     start, camera = by_images.T_camera_world, sparse_map.rig.camera
     found = refine_pose(camera, start, points, seen, prior, is_noise_known=True)
     return replace(by_images, T_camera_world=found.T_camera_world, covariance=found.covariance)
-
-
-def _with_patch_noise(images: Images, observed: ObservedFeatures, track: Track) -> ObservedFeatures:
-    """Return the features of a frame; with the noise of their patches where wheels know some
-    direction of its pose better than they do.
-    """
-    if not track.is_prior_better:
-        return observed
-    noisy = with_patch_noise(images.left, observed.observations, not images.depth_scale)
-    return replace(observed, observations=noisy)
 
 
 def is_near(T_camera_world: Array, expected: PoseEstimate | None) -> bool:

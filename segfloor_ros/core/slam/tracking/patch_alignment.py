@@ -13,12 +13,10 @@ itself, a plain face not at all. Patches that overlap hold the same pixels and e
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from segfloor_ros.core.camera.pixels import disparity_at
 from segfloor_ros.core.geometry import Array
@@ -54,17 +52,11 @@ MAX_STEP = np.array([MAX_SHIFT_STEP_PX, AFFINE_SIGMA, AFFINE_SIGMA])[:, None]
 
 Patches = NDArray[np.float32]
 
-ALIASED = 0.3
+ALIASED = 0.1
 """Share of the slopes across an edge that its sampling in steps of pixels shows along it."""
-
-CELLS, PER_CELL = 80, 3
-"""Parts into which an image is divided, and points of each that count: neighbours err together."""
 
 LEAST_ENERGY = 1e-3
 """Mean square of a slope, in grey levels squared: of an edge, along it; of a plain face."""
-
-LEAST_SHIFT = 1e-4
-"""Information in 1/px² of the shift of a pixel along an edge, or on a plain face."""
 
 
 def _sums_of_a_patch() -> tuple[Patches, Patches, Patches, Patches]:
@@ -154,7 +146,7 @@ def align_patches(
 
 def known_shift(energy: Array) -> Array:
     """Return the variances (axes, N) of the shift of patches of unit noise, by the mean products
-    (axes, axes, N) of their slopes: freed of what noise, and the sampling of an edge, show of slopes
+    (axes, axes, N) of their slopes, freed of what noise and the sampling of an edge show of slopes
     that are none.
     """
     noise = GREY_NOISE**2 / 2
@@ -412,56 +404,3 @@ def refine_disparity(
     disparity[rows] = uv_px[rows, 0] - found_u
     sigma[rows] = found.sigma_px[found.sound, 0]
     return disparity, sigma
-
-
-def count_firm(image: NDArray[Any], uv_px: Array) -> int:
-    """Return how many pixels (N, 2) of a grey image (H, W) are on corners or in textures, whose
-    patches determine their shift in both directions; of many in one part of the image some.
-    """
-    known, _ = _known_shift(image, uv_px)
-    firm = uv_px[(known > 0).all(axis=1)]
-    cell = (firm // np.sqrt(image.size / CELLS)).astype(np.intp)
-    _, counts = np.unique(cell, axis=0, return_counts=True)
-    return int(np.minimum(counts, PER_CELL).sum())
-
-
-def with_patch_noise(
-    image: NDArray[Any], observations: Observations, is_matched: bool = True
-) -> Observations:
-    """Return observations (N) that have at least the noise that the patches of a grey image (H, W)
-    around them allow: on an edge, that along it; disparities only where they are matched.
-    """
-    known, axes = _known_shift(image, observations.uvd_px[:, :2])
-    shift = (axes * known[:, None]) @ np.swapaxes(axes, 1, 2) + LEAST_SHIFT * np.eye(2)
-    variance = np.einsum('nii->ni', np.linalg.inv(shift))
-    least = np.sqrt(np.column_stack([variance, is_matched / shift[:, 0, 0]]))
-    return replace(observations, sigma_px=np.maximum(observations.sigma_px, least))
-
-
-def _known_shift(image: NDArray[Any], uv_px: Array) -> tuple[Array, Array]:
-    """Return what patches around pixels (N, 2) know of their shift along two axes, in 1/px² (N, 2),
-    freed of what noise alone would show and shared by those that overlap, and the axes (N, 2, 2),
-    one a column.
-    """
-    smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
-    height, width = image.shape
-    columns, rows = np.rint(uv_px).astype(np.intp).T
-    steps = np.arange(-HALF_PATCH_PX - 1, HALF_PATCH_PX + 2)
-    patches = smooth[
-        np.clip(rows[:, None, None] + steps[:, None], 0, height - 1),
-        np.clip(columns[:, None, None] + steps, 0, width - 1),
-    ].astype(np.float32)
-    by_u = (patches[:, 1:-1, 2:] - patches[:, 1:-1, :-2]) / 2
-    by_v = (patches[:, 2:, 1:-1] - patches[:, :-2, 1:-1]) / 2
-    slopes = np.stack([by_u, by_v], axis=1).reshape(len(uv_px), 2, SIDE_PX**2)
-    energy, axes = np.linalg.eigh(slopes @ np.swapaxes(slopes, 1, 2))
-    # The mean square of a slope of white noise of unit variance, smoothed by one pixel.
-    of_noise = GREY_NOISE**2 * SIDE_PX**2 / (8 * np.pi)
-    apparent = 2 * of_noise + ALIASED * energy[:, 1:]
-    known = np.maximum(energy - apparent, 0.0) / GREY_NOISE**2
-    known /= 1 + MIN_SIGMA_PIXEL**2 * known
-    if len(uv_px):
-        tree = cKDTree(uv_px)
-        crowd = tree.query_ball_point(uv_px, HALF_PATCH_PX, return_length=True)
-        known /= np.asarray(crowd)[:, None]
-    return known, axes
