@@ -133,8 +133,10 @@ class CameraMotion:
     def expected(self, stamp_ns: int) -> PoseEstimate:
         """Return where the camera will be if its motion goes on, as far as that of a robot does."""
         sigma = 0.5 * _step_s(self._last_stamp_ns, stamp_ns) ** 2 * ACCELERATION
-        covariance = self.covariance + np.diag(np.repeat(sigma**2, 6))
-        return PoseEstimate(self.predict(stamp_ns), np.zeros(0, bool), covariance, 1.0)
+        predicted = self.predict(stamp_ns)
+        moved = RelativeMotion(predicted @ invert(self.T_camera_world), sigma**2 * np.eye(6))
+        _, covariance = _moved((self.T_camera_world, self.covariance), moved)
+        return PoseEstimate(predicted, np.zeros(0, bool), covariance, 1.0)
 
     def is_plausible(self, T_camera_world: Array, stamp_ns: int) -> bool:
         """Whether a robot can have come to a pose since the last frame."""
