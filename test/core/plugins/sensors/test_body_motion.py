@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.core.contracts import ImuSample, Mount, RelativeMotion, WheelPose
+from segfloor_ros.core.contracts import ImuSample, Mount, WheelPose
 from segfloor_ros.core.geometry import invert, make_transform
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.plugins.sensors.gyroscope import KEPT_NS, STEP_NS, Gyroscope, TimedSeries
@@ -19,8 +19,7 @@ from segfloor_ros.core.plugins.sensors.wheel_odometry import (
     Window,
     rotation_2d,
 )
-from segfloor_ros.core.slam.tracking.motion import joined_motion
-from segfloor_ros.core.twists import adjoint, se3_exp, se3_log
+from segfloor_ros.core.twists import adjoint, se3_exp
 
 MS = 1_000_000
 
@@ -320,23 +319,6 @@ def test_without_mount_or_wheels_there_is_no_way():
     body.T_base_left = Mount(0.3).T_base_left
     assert body.between(0, 100 * MS) is not None
     assert body.between(200 * MS, 900 * MS) is None
-
-
-def test_motions_add_up_with_their_covariances():
-    rng = np.random.default_rng(2)
-    parts = [
-        RelativeMotion(se3_exp(rng.normal(size=6) * 0.3), np.diag(rng.uniform(1, 4, 6) * 1e-6))
-        for _ in range(2)
-    ]
-    together = joined_motion(*parts)
-    draws = []
-    for _ in range(4000):
-        noisy = [
-            se3_exp(rng.multivariate_normal(np.zeros(6), p.covariance)) @ p.T_now_before
-            for p in parts
-        ]
-        draws.append(se3_log(noisy[1] @ noisy[0] @ invert(together.T_now_before)))
-    np.testing.assert_allclose(np.cov(np.array(draws).T), together.covariance, atol=1e-6)
 
 
 def test_the_adjoint_carries_a_twist_over_a_transform():
