@@ -311,6 +311,25 @@ def test_a_ramp_that_shows_more_than_the_floor_is_not_what_the_robot_drives_on(T
     assert np.degrees(estimator.mount.pitch_rad) == pytest.approx(7.0, abs=0.6)
 
 
+def test_a_camera_that_was_lost_is_measured_by_what_it_sees_since():
+    """It stood on a stage before: by the frames of both worlds it would have no mount at all."""
+    before, now = (
+        replace(Scene([floor_patch(), wall()], camera=SMALL_CAMERA, noise_grey=1.0), mount=mount)
+        for mount in (Mount(0.3, np.radians(7.0)), Mount(0.45, np.radians(12.0)))
+    )
+    estimator = MountEstimator(SMALL_CAMERA)
+    weak = replace(before, patches=[floor_patch(contrast=2.0), wall()], noise_grey=4.0)
+    for _ in range(3):
+        estimator.add(*weak.render()[:2], np.eye(4))
+    assert estimator.mount is None
+    estimator.reset()
+    for _ in range(4):
+        estimator.add(*now.render()[:2], LEANING)
+    assert estimator.mount is not None
+    assert estimator.mount.height_m == pytest.approx(0.45, rel=0.03)
+    assert np.degrees(estimator.mount.pitch_rad) == pytest.approx(12.0, abs=0.4)
+
+
 def test_disagreement_names_both_numbers():
     used, seen = Mount(0.35, np.radians(7.0)), Mount(0.30, np.radians(10.0))
     words = disagreement(used, seen, np.zeros(3))
