@@ -5,11 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from sampled_poses import assert_spread, drawn_poses, twists_from, uneven_covariance
+from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.core.contracts import FrameResult, MovingPoints
-from segfloor_ros.core.geometry import invert, make_transform
+from segfloor_ros.core.geometry import Array, invert, make_transform
+from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.held_results import in_map
-from segfloor_ros.core.twists import se3_exp
+from segfloor_ros.core.slam.settings import StereoSlamSettings
+from segfloor_ros.core.twists import rotation_vectors, se3_exp
 
 RNG = np.random.default_rng(11)
 T_BASE_LEFT = se3_exp(np.array([0.3, -0.1, 0.5, -1.4, 0.2, -1.5]))
@@ -47,26 +51,40 @@ def test_what_moves_goes_in_the_map_from_where_it_was_to_where_it_is() -> None:
     np.testing.assert_allclose(gone, will.xyz_map, atol=1e-5)
 
 
-def test_the_covariance_is_that_of_the_place_and_the_turn_of_the_base_in_odom() -> None:
-    scale = np.diag([0.02, 0.005, 0.01, 0.004, 0.008, 0.002])
-    mixed = scale @ (np.eye(6) + 0.3 * RNG.normal(size=(6, 6)))
-    covariance = mixed @ mixed.T
-    T_odom_base = in_map(result(covariance), T_BASE_LEFT).T_odom_base
-    errors = []
-    for twist in RNG.multivariate_normal(np.zeros(6), covariance, 20_000):
-        camera = se3_exp(twist) @ T_CAMERA_WORLD
-        base = T_BASE_LEFT @ invert(camera) @ invert(T_BASE_LEFT)
-        turned = base[:3, :3] @ T_odom_base[:3, :3].T
-        axis = 0.5 * np.array(
-            [turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]
-        )
-        errors.append(np.append(base[:3, 3] - T_odom_base[:3, 3], axis))
-    expected = np.cov(np.array(errors).T)
-    found = in_map(result(covariance), T_BASE_LEFT).covariance
-    sigma = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(
-        found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=0.05
-    )
+def errors_from(T: Array, samples: Array) -> Array:
+    """Return the errors (N, 6) of the place and the turn of samples (N, 4, 4), in the axes of the
+    frame in which T (4, 4) and they are given.
+    """
+    turns = rotation_vectors(samples[:, :3, :3] @ T[:3, :3].T)
+    return np.concatenate([samples[:, :3, 3] - T[:3, 3], turns], axis=1)
+
+
+T_MAP_ODOM = se3_exp(np.array([0.2, -0.3, 0.1, 0.4, -0.3, 0.9]))
+
+
+def test_the_covariance_is_that_of_the_place_and_the_turn_of_the_base_in_odom_and_map() -> None:
+    covariance = uneven_covariance(RNG, 3.0)
+    T_world_odom = invert(T_BASE_LEFT) @ T_MAP_ODOM @ T_BASE_LEFT
+    found = in_map(replace(result(covariance), T_map_odom=T_world_odom), T_BASE_LEFT)
+    cameras = drawn_poses(RNG, T_CAMERA_WORLD, covariance)
+    bases = T_BASE_LEFT @ invert(cameras) @ invert(T_BASE_LEFT)
+    assert_spread(errors_from(found.T_odom_base, bases), found.covariance)
+    T_map_base = found.T_map_odom @ found.T_odom_base
+    assert_spread(errors_from(T_map_base, found.T_map_odom @ bases), found.covariance_in_map)
+
+
+def test_a_pose_is_as_unsure_as_where_its_map_began_and_the_way_since() -> None:
+    """A drive that was broken off maps on its own, from a place that is unsure."""
+    began = se3_exp(np.array([-0.6, 0.8, 0.3, -0.5, 0.4, 0.7]))
+    of_start, of_way = uneven_covariance(RNG, 4.0), uneven_covariance(RNG)
+    slam = equipped_slam(CAMERA, StereoSlamSettings(), MOUNT)
+    slam.front_end.motion.take(T_CAMERA_WORLD, of_way, 0)
+    slam._began_unsure = began, of_start
+    last = slam.last_pose
+    assert last is not None
+    way = drawn_poses(RNG, T_CAMERA_WORLD @ invert(began), of_way)
+    samples = way @ drawn_poses(RNG, began, of_start)
+    assert_spread(twists_from(T_CAMERA_WORLD, samples), last.covariance)
 
 
 def test_a_tilted_mount_turns_the_axes_of_the_covariance() -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from node_messages import grid_arrays
 from rclpy.serialization import deserialize_message, serialize_message
+from sampled_poses import assert_spread, drawn_errors, uneven_covariance
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration, eye_calibration
@@ -203,6 +204,26 @@ def test_the_covariance_of_the_velocity_is_that_of_both_poses_in_the_moving_fram
     np.testing.assert_allclose(ahead[:2, :2], [[2.0, -2.0], [-2.0, 2.0]], atol=1e-12)
     message = odometry.odometry_message(0, 'odom', 'base_link', left, now, np.ones(6), found)
     np.testing.assert_allclose(over_the_wire(message).twist.covariance.reshape(6, 6), found)
+
+
+def test_a_velocity_is_as_unsure_as_samples_of_both_poses() -> None:
+    """A base that pitches, rolls and turns, somewhere in a frame with other axes."""
+    rng = np.random.default_rng(1)
+    before = se3_exp(np.array([0.7, -0.4, 1.5, 0.3, -0.9, 0.2]))
+    now = before @ se3_exp(np.array([0.04, 0.01, -0.01, 0.02, -0.03, 0.04]))
+    covariances = uneven_covariance(rng), uneven_covariance(rng)
+    pairs = []
+    for T, covariance in zip((before, now), covariances, strict=True):
+        # Errors of place and turn, in the axes of the frame.
+        errors = drawn_errors(rng, covariance, 2000)
+        samples = np.tile(T, (len(errors), 1, 1))
+        samples[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ T[:3, :3]
+        samples[:, :3, 3] += errors[:, :3]
+        pairs.append(samples)
+    mean = odometry.body_twist(before, now, 0.1)
+    twists = np.array([odometry.body_twist(a, b, 0.1) for a, b in zip(*pairs, strict=True)])
+    expected = odometry.twist_covariance(covariances[0], now, covariances[1], 0.1)
+    assert_spread(twists - mean, expected)
 
 
 def test_no_variance_is_below_the_least_one() -> None:

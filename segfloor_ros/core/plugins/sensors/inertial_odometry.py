@@ -145,7 +145,7 @@ class Gravity:
     def __init__(self, gyroscope: Gyroscope) -> None:
         self._gyroscope = gyroscope
         self._poses: deque[tuple[int, Array]] = deque(maxlen=3)
-        self._latest: tuple[Array, Array] | None = None
+        self._latest: tuple[Array, Array, Array] | None = None
         self._measured = 0
         self._state: Array = np.zeros(6)
         variance = np.repeat([UNKNOWN_COVARIANCE, SIGMA_BIAS_M_S2**2], 3)
@@ -174,11 +174,13 @@ class Gravity:
         latest, self._latest = self._latest, None
         if latest is None or not self._is_known:
             return None
-        lift_odom, R_world_odom = latest
-        R_camera_odom = T_odom_camera[:3, :3].T
-        H = _design(R_world_odom @ R_camera_odom.T)
+        lift_world, R_world_measured, R_world_odom = latest
+        R_camera_world = (R_world_odom @ T_odom_camera[:3, :3]).T
+        # The bias is that of the axes in which it was measured; the camera may have turned since.
+        H = R_camera_world @ _design(R_world_measured)
         covariance = H @ self._covariance @ H.T + SIGMA_LIFT_M_S2**2 * np.eye(3)
-        return _up(R_camera_odom @ lift_odom - self._state[3:], covariance)
+        lift = R_camera_world @ (lift_world - R_world_measured @ self._state[3:])
+        return _up(lift, covariance)
 
     def see(self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array) -> None:
         """Take in the pose of a frame that images or wheels show."""
@@ -191,8 +193,9 @@ class Gravity:
         if lift_odom is None:
             return
         R_world_camera = R_world_odom @ self._poses[1][1][:3, :3]
-        if self._learn(R_world_odom @ lift_odom, _design(R_world_camera)):
-            self._latest = lift_odom, R_world_odom
+        lift_world = R_world_odom @ lift_odom
+        if self._learn(lift_world, _design(R_world_camera)):
+            self._latest = lift_world, R_world_camera, R_world_odom
 
     def reset(self) -> None:
         """Forget the latest poses; what is known of gravity stays."""

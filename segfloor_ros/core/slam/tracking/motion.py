@@ -135,8 +135,10 @@ class CameraMotion:
         measured = self.measured(stamp_ns)
         predicted = self._predicted(measured)
         if measured is None or predicted is None:
-            goes_on = self.covariance + self._surprises.covariance(step_s)
-            return _estimate(self.predict(stamp_ns), goes_on)
+            steady = self.predict(stamp_ns)
+            goes_on = self._surprises.covariance(step_s)
+            moved = RelativeMotion(steady @ invert(self.T_camera_world), goes_on)
+            return _estimate(*_moved((self.T_camera_world, self.covariance), moved))
         pose, covariance = predicted[0], predicted[1].copy()
         if not measured.by_wheels:
             covariance[:3, :3] += (SPEED_SIGMA * step_s) ** 2 * np.eye(3)

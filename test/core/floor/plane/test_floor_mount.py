@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from floor_scenes import SMALL_CAMERA, Patch, Scene, blank_floored, box, floor_patch, wall
+from floor_scenes import SMALL_CAMERA, Patch, Scene, blank_floored, box, floor_patch, ramp, wall
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import Mount, StereoFrame
@@ -19,7 +19,11 @@ from segfloor_ros.core.floor.plane.plane import mean_climb, shares
 from segfloor_ros.core.plugins.assembly import make_pipeline, make_slam
 from segfloor_ros.core.plugins.sensors.gyroscope import STEP_NS
 from segfloor_ros.core.slam.settings import StereoSlamSettings
+from segfloor_ros.core.twists import se3_exp
 from segfloor_ros.nodes.configuration import resolve
+
+LEANING = se3_exp(np.array([0.4, 0.1, -0.3, 0.7, -0.4, 0.3]))
+"""The first camera in a world whose axes are pitched, turned and rolled."""
 
 
 def estimate(scene: Scene, **known) -> Mount | None:
@@ -273,19 +277,57 @@ def test_a_level_path_leaves_a_plane_that_dips():
 
 
 @pytest.mark.parametrize(('path_deg', 'settles'), [(0.0, True), (25.0, False)])
-def test_a_floor_that_the_robot_drives_into_is_none(path_deg, settles):
+@pytest.mark.parametrize('T_world_first', [np.eye(4), LEANING], ids=['level', 'leaning'])
+def test_a_floor_that_the_robot_drives_into_is_none(path_deg, settles, T_world_first):
+    """The axes of the world need not be those of the first camera: a map may begin on a ramp."""
     scene = Scene([floor_patch(), wall()])
     estimator = MountEstimator(scene.camera)
     bare_left, bare_right, _, _ = Scene([wall(1.0)], mount=scene.mount).render()
-    estimator.add(bare_left, bare_right, np.eye(4))
+    estimator.add(bare_left, bare_right, T_world_first)
     assert estimator.mount is None
     moved = np.eye(4)
     into_floor = scene.mount.pitch_rad - np.radians(path_deg)
     moved[:3, 3] = 0.6 * np.array([0.0, -np.sin(into_floor), np.cos(into_floor)])
     left, right, _, _ = scene.render()
     for _ in range(4):
-        estimator.add(left, right, moved)
+        estimator.add(left, right, T_world_first @ moved)
     assert (estimator.mount is not None) is settles
+
+
+@pytest.mark.parametrize('T_world_first', [np.eye(4), LEANING], ids=['level', 'leaning'])
+def test_a_ramp_that_shows_more_than_the_floor_is_not_what_the_robot_drives_on(T_world_first):
+    """Its way says which of both is the floor, whatever the axes of the world."""
+    ahead = ramp(1.0, np.radians(18.0), contrast=30.0)
+    scene = Scene([floor_patch(far_m=1.0, contrast=6.0), ahead], camera=SMALL_CAMERA)
+    bare = Scene([wall(1.0)], camera=SMALL_CAMERA, mount=scene.mount)
+    estimator = MountEstimator(SMALL_CAMERA)
+    T_left_base = np.linalg.inv(scene.mount.T_base_left)
+    for i in range(4):
+        here = replace(scene.mount, forward_m=0.15 * i)
+        left, right, _, _ = replace(scene if i else bare, mount=here).render()
+        estimator.add(left, right, T_world_first @ T_left_base @ here.T_base_left)
+    assert estimator.mount is not None
+    assert estimator.mount.height_m == pytest.approx(0.3, rel=0.03)
+    assert np.degrees(estimator.mount.pitch_rad) == pytest.approx(7.0, abs=0.6)
+
+
+def test_a_camera_that_was_lost_is_measured_by_what_it_sees_since():
+    """It stood on a stage before: by the frames of both worlds it would have no mount at all."""
+    before, now = (
+        replace(Scene([floor_patch(), wall()], camera=SMALL_CAMERA, noise_grey=1.0), mount=mount)
+        for mount in (Mount(0.3, np.radians(7.0)), Mount(0.45, np.radians(12.0)))
+    )
+    estimator = MountEstimator(SMALL_CAMERA)
+    weak = replace(before, patches=[floor_patch(contrast=2.0), wall()], noise_grey=4.0)
+    for _ in range(3):
+        estimator.add(*weak.render()[:2], np.eye(4))
+    assert estimator.mount is None
+    estimator.reset()
+    for _ in range(4):
+        estimator.add(*now.render()[:2], LEANING)
+    assert estimator.mount is not None
+    assert estimator.mount.height_m == pytest.approx(0.45, rel=0.03)
+    assert np.degrees(estimator.mount.pitch_rad) == pytest.approx(12.0, abs=0.4)
 
 
 def test_disagreement_names_both_numbers():

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from segfloor_ros.core.camera.model import OFFSET_SIGMA_PX, StereoCamera
-from segfloor_ros.core.contracts import Up
+from segfloor_ros.core.contracts import Mount, Up
 from segfloor_ros.core.floor.disparity.matching import BLOCK_PX, refined
 from segfloor_ros.core.floor.plane.mount import MountViewer, PlaneSearch, level_prior
-from segfloor_ros.core.floor.plane.plane import PlaneFit, Samples, plane_of, refine
+from segfloor_ros.core.floor.plane.plane import LEVEL_SIGMA, PlaneFit, Samples, plane_of, refine
+from segfloor_ros.core.twists import se3_exp
 
 UNKNOWN, STILL = np.full(3, np.nan), np.zeros((0, 3))
 NOTHING = Samples(np.zeros((0, 3)), np.zeros(0), np.zeros(0), 1.0)
@@ -39,6 +40,16 @@ def found(frames: list[Samples], up: Up | None) -> np.ndarray:
     fits = [search.add(frame, level_prior(up, np.eye(4)), STILL, []) for frame in frames]
     assert fits[-1] is not None
     return fits[-1].angles_height
+
+
+def test_a_floor_is_level_in_the_camera_as_it_is_in_a_world_that_leans() -> None:
+    """The world has the axes of a camera that was pitched, turned and rolled."""
+    mount = Mount(0.4, pitch_rad=0.35, roll_rad=-0.2)
+    T_world_left = se3_exp(np.array([0.4, 0.1, -0.3, 0.7, -0.4, 0.3]))
+    up_world = T_world_left[:3, :3] @ mount.up_in_camera
+    mean, sigma = level_prior(Up(up_world, 0.01), T_world_left)
+    np.testing.assert_allclose(mean[:2], [mount.pitch_rad, mount.roll_rad], atol=1e-9)
+    assert 0.01 < sigma[0] == sigma[1] < LEVEL_SIGMA[0]
 
 
 def test_with_little_floor_in_view_up_tells_pitch_and_roll() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.core.contracts import ImuSample, Mount, RelativeMotion, WheelPose
+from segfloor_ros.core.contracts import ImuSample, Mount, WheelPose
 from segfloor_ros.core.geometry import invert, make_transform
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.plugins.sensors.gyroscope import KEPT_NS, STEP_NS, Gyroscope, TimedSeries
@@ -19,8 +19,7 @@ from segfloor_ros.core.plugins.sensors.wheel_odometry import (
     Window,
     rotation_2d,
 )
-from segfloor_ros.core.slam.tracking.motion import joined_motion
-from segfloor_ros.core.twists import adjoint, se3_exp, se3_log
+from segfloor_ros.core.twists import adjoint, se3_exp
 
 MS = 1_000_000
 
@@ -219,6 +218,26 @@ def test_stamps_of_an_imu_that_are_late_are_found_out():
     assert '30 ms later' in gyro.remarks()['imu lag']
 
 
+def test_a_lag_is_found_where_the_axis_of_the_turn_moves():
+    """The camera turns and nods: the axes of the end are not those of the beginning."""
+
+    def turned(t):
+        return Rotation.from_euler('ZX', np.stack([1.5 * t, 1.0 * np.sin(2 * t)], axis=-1))
+
+    lag_s, gyro, h = 0.03, Gyroscope(), 1e-3
+    stamps = np.arange(0, 12000, 10)
+    late = stamps / 1000 - lag_s
+    rates = (turned(late - h).inv() * turned(late + h)).as_rotvec() / (2 * h)
+    for t, rate in zip(stamps.tolist(), rates, strict=True):
+        gyro.add(ImuSample(t * MS, rate, np.zeros(3)))
+    ends = 0.4 * np.arange(1, 29)
+    seen = (turned(ends[:-1]).inv() * turned(ends[1:])).as_matrix()
+    for k, R in enumerate(seen, 1):
+        gyro.learn(R, k * 400 * MS, (k + 1) * 400 * MS)
+    assert gyro.lag_s == pytest.approx(lag_s, abs=1e-3)
+    np.testing.assert_allclose(gyro.bias_rad_s, 0.0, atol=1e-3)
+
+
 def test_a_straight_way_tells_nothing_of_the_lag_of_an_imu():
     rng, gyro = np.random.default_rng(1), Gyroscope()
     for t in range(0, 10_000, 5):
@@ -256,6 +275,14 @@ def test_what_was_found_turns_what_wheels_tell_into_the_motion_of_the_base():
     assert turn_rad == pytest.approx(0.3)
     # The chord is that of the arc as measured, turned by what the turn was wrong.
     np.testing.assert_allclose(way_m, [0.2, 0.03], atol=2e-3)
+
+
+def test_the_chord_of_an_arc_points_half_the_turn_to_the_side_that_a_gyroscope_measures():
+    """Wheels measure an arc of 0.6 rad, a gyroscope half of that."""
+    chord_m = 0.5 * np.array([np.cos(0.3), np.sin(0.3)])
+    way_m, turn_rad = WheelCalibration().base_motion(base_pose(*chord_m, 0.6), 0.3)
+    assert turn_rad == 0.3
+    np.testing.assert_allclose(way_m, 0.5 * np.array([np.cos(0.15), np.sin(0.15)]), atol=1e-12)
 
 
 def test_wheels_that_are_right_are_not_remarked_upon_and_slip_is_noticed():
@@ -320,23 +347,6 @@ def test_without_mount_or_wheels_there_is_no_way():
     body.T_base_left = Mount(0.3).T_base_left
     assert body.between(0, 100 * MS) is not None
     assert body.between(200 * MS, 900 * MS) is None
-
-
-def test_motions_add_up_with_their_covariances():
-    rng = np.random.default_rng(2)
-    parts = [
-        RelativeMotion(se3_exp(rng.normal(size=6) * 0.3), np.diag(rng.uniform(1, 4, 6) * 1e-6))
-        for _ in range(2)
-    ]
-    together = joined_motion(*parts)
-    draws = []
-    for _ in range(4000):
-        noisy = [
-            se3_exp(rng.multivariate_normal(np.zeros(6), p.covariance)) @ p.T_now_before
-            for p in parts
-        ]
-        draws.append(se3_log(noisy[1] @ noisy[0] @ invert(together.T_now_before)))
-    np.testing.assert_allclose(np.cov(np.array(draws).T), together.covariance, atol=1e-6)
 
 
 def test_the_adjoint_carries_a_twist_over_a_transform():

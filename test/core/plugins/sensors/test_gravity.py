@@ -10,6 +10,7 @@ from segfloor_ros.core.contracts import ImuSample
 from segfloor_ros.core.geometry import make_transform
 from segfloor_ros.core.plugins.sensors.gyroscope import Gyroscope
 from segfloor_ros.core.plugins.sensors.inertial_odometry import Gravity
+from segfloor_ros.core.twists import se3_exp
 
 UP = np.array([0.03, -0.99, -0.12]) / np.linalg.norm([0.03, -0.99, -0.12])
 """Up in the first camera: it looks 7 degrees down and hardly rolls."""
@@ -94,3 +95,52 @@ def test_up_is_the_same_in_a_world_that_is_turned_from_odom():
     assert degrees_between(gravity.up_world.direction, UP) < 0.1
     up = gravity.up_camera(T_odom_world @ pose(6.0, False))
     assert degrees_between(up.direction, UP) < 1.0
+
+
+LEANING_UP = np.array([0.4, -0.8, 0.45]) / np.linalg.norm([0.4, -0.8, 0.45])
+T_WORLD_ODOM = se3_exp(np.array([0.4, 1.0, -0.3, 0.5, 0.3, -0.8]))
+LARGE_BIAS = np.array([0.15, -0.1, 0.2])
+
+
+def turned(t):
+    """Return how a camera stands that nods and turns, in a world that is not level."""
+    angles = np.stack([0.9 * np.sin(0.5 * t), 0.4 * np.sin(0.8 * t)], -1)
+    return Rotation.from_rotvec([0.3, -0.9, 0.2]) * Rotation.from_euler('YX', angles)
+
+
+def place(t):
+    return np.stack([0.3 * (1 - np.cos(1.5 * t)), 0.1 * np.sin(t), 0.4 * np.sin(0.7 * t)], -1)
+
+
+def test_up_is_known_in_the_axes_of_a_camera_that_nods_and_turns():
+    """The bias of the accelerometer is 1.5 degrees, and turns along with the camera."""
+    gyroscope, h, t = Gyroscope(), 1e-3, np.arange(2001) / 100
+    gravity, T_odom_world = Gravity(gyroscope), np.linalg.inv(T_WORLD_ODOM)
+    rates = (turned(t - h).inv() * turned(t + h)).as_rotvec() / (2 * h)
+    accel = (place(t + h) - 2 * place(t) + place(t - h)) / h**2
+    lifted = turned(t).inv().apply(accel + 9.81 * LEANING_UP) + LARGE_BIAS
+    errors_deg, R, p = [], turned(t).as_matrix(), place(t)
+    for k in range(len(t)):
+        gyroscope.add(ImuSample(k * 10**7, rates[k], lifted[k]))
+        if k % 10 == 0:
+            T_odom_camera = T_odom_world @ make_transform(R[k], p[k])
+            gravity.see(k * 10**7, T_odom_camera, T_WORLD_ODOM[:3, :3])
+            up = gravity.up_camera(T_odom_camera)
+            if up is not None and k > 1000:
+                errors_deg.append(degrees_between(up.direction, R[k].T @ LEANING_UP))
+    assert len(errors_deg) > 15
+    assert max(errors_deg) < 0.06
+    assert degrees_between(gravity.up_world.direction, LEANING_UP) < 0.03
+
+
+def test_what_was_measured_while_no_frame_came_is_not_taken_for_gravity():
+    """The camera stands; something pushes it while no image comes for two seconds."""
+    gyroscope = Gyroscope()
+    gravity = Gravity(gyroscope)
+    for k in range(601):
+        push = np.array([3.0, 0.0, 0.0]) if 60 < k < 240 else np.zeros(3)
+        gyroscope.add(ImuSample(k * 10**7, np.zeros(3), 9.81 * UP + push))
+        if k % 50 == 0 and not 50 < k < 250:
+            gravity.see(k * 10**7, FIRST, FIRST[:3, :3])
+    assert gravity.up_world is not None
+    assert degrees_between(gravity.up_world.direction, UP) < 0.1

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -13,10 +16,13 @@ from segfloor_ros.core.slam.mapping.normal_equations import (
     Links,
     System,
     cost,
+    factors_of,
+    loop_factors,
     squared_errors,
     with_factors,
 )
 from segfloor_ros.core.slam.rig import chi2_limit
+from segfloor_ros.core.slam.sparse_map import LoopEdge
 from segfloor_ros.core.twists import se3_exp, se3_log
 
 UP = np.array([0.03, -0.99, -0.12]) / np.linalg.norm([0.03, -0.99, -0.12])
@@ -104,3 +110,56 @@ def test_a_keyframe_that_tilts_is_turned_back():
     assert np.linalg.norm(levels[0].errors(poses)) < 0.01 * before
     # Turning about up is free.
     assert Rotation.from_matrix(poses[0, :3, :3]).magnitude() == pytest.approx(0.3, abs=0.03)
+
+
+SLOT = np.array([2, -1, 0, 3, 1])
+"""Where keyframes are in a problem; the second one is not in it."""
+
+DRIVE = np.stack([se3_exp(RNG.normal(size=6) * 0.4) for _ in range(5)])
+
+
+def in_problem():
+    poses = np.zeros((4, 4, 4))
+    poses[SLOT[SLOT >= 0]] = DRIVE[SLOT >= 0]
+    return poses
+
+
+def test_motions_and_ups_are_those_of_the_keyframes_wherever_these_are_in_a_problem():
+    motions = [RelativeMotion(T @ invert(b), COVARIANCE) for b, T in pairwise(DRIVE)]
+    ups = [Up(T[:3, :3] @ UP, 0.01) for T in DRIVE]
+    keyframes = [
+        SimpleNamespace(motion=m, up=u) for m, u in zip([None, *motions], ups, strict=True)
+    ]
+    links, levels = factors_of(keyframes, SLOT, Up(UP, 0.01))
+    # No motion ends at the first one, and none at or after the one that is left out counts.
+    assert len(links.keyframes) == 2 and len(levels.keyframes) == 4
+    for factors in (links, levels):
+        np.testing.assert_allclose(factors.errors(in_problem()), 0.0, atol=1e-9)
+
+
+def test_a_loop_by_the_floor_ties_both_its_keyframes_wherever_they_are_in_a_problem():
+    loops = [
+        LoopEdge(i, j, DRIVE[i] @ invert(DRIVE[j]), i != 4) for i, j in ((3, 0), (1, 0), (4, 2))
+    ]
+    (links,) = loop_factors(loops, SLOT)
+    assert len(links.keyframes) == 1
+    np.testing.assert_allclose(links.errors(in_problem()), 0.0, atol=1e-9)
+    np.testing.assert_allclose(links.errors(POSES[[0, 1, 2, 0]]), se3_logs_of(loops[0]), atol=1e-9)
+
+
+def se3_logs_of(loop):
+    """Return the twist by which other poses miss a loop of the last keyframe to the third."""
+    return [se3_log(POSES[0] @ invert(POSES[2]) @ invert(loop.T_i_j))]
+
+
+def test_a_keyframe_that_pitches_and_rolls_is_level_to_first_order():
+    """The derivative of the tilt is that of its differences, wherever up is."""
+    poses, h = DRIVE[:3], 1e-6
+    levels = Levels.of([(k, Up(se3_exp(0.05 * RNG.normal(size=6))[:3, :3] @ T[:3, :3] @ UP, 0.01))
+                        for k, T in enumerate(poses)], UP)[0]  # fmt: skip
+    for axis in range(6):
+        twist = h * np.eye(6)[axis]
+        ahead, behind = (levels.errors(se3_exp(sign * twist) @ poses) for sign in (1, -1))
+        np.testing.assert_allclose(
+            levels.jacobians(poses)[:, 0, :, axis], (ahead - behind) / (2 * h), atol=1e-6
+        )
