@@ -38,6 +38,9 @@ from tools.recorded_frames import (
 from tools.tracked_frames import TrackedFrames, track_frames
 
 DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
+WIDTH = 160
+"""Columns that the table needs."""
+
 RECORDINGS = (
     'freiburg3_cabinet', 'kitchen', 'kitti06', 'library', 'rover', 'backyard', 'corridor',
     'euroc_tiny', 'tumvi',
@@ -55,7 +58,8 @@ more than `GOOD_M`."""
 class Row:
     """One recording in one variant. placed: steps that the plain method places, of frames - 1;
     needed: the median of the inliers that this takes, inliers: of those there are. tracked: frames
-    of SLAM in the map at the end; lost and weak: what it says itself. missed: frames of placed
+    of SLAM in the map at the end; apart: in submaps that were left out; lost and weak: what it says
+    itself. missed: frames of placed
     steps of which SLAM lacks a pose at either end; wrong: where it has both, and errs. Errors: of
     the steps, in m, where the truth is known. seconds: CPU time of SLAM.
     """
@@ -68,6 +72,7 @@ class Row:
     inliers: float
     tracked: int
     lost: int
+    apart: int
     weak: int
     missed: list[int]
     wrong: list[int]
@@ -136,7 +141,7 @@ def plain_pnp(
                 console.print(_line(row), highlight=False)
                 if json_file:
                     json_file.write_text(json.dumps([dataclasses.asdict(r) for r in rows], indent=1))
-    console.print(table_of(rows, before))
+    console.print(table_of(rows, before), crop=False, width=max(console.width, WIDTH))
     console.print(f'{time.perf_counter() - start_s:.0f} s', highlight=False)
 
 
@@ -191,7 +196,8 @@ def compare_steps(
         float(np.median(plain.needed[1:])),
         float(np.median(plain.inliers[1:])),
         int(has_pose.sum()),
-        sum(not result.tracked for result in slam.results),
+        slam.lost,
+        len(placed) - slam.lost - int(has_pose.sum()),
         slam.weak,
         np.flatnonzero(placed & ~has_step).tolist(),
         np.flatnonzero(wrong).tolist(),
@@ -219,7 +225,7 @@ def rows_by_name(file: Path) -> dict[str, Row]:
 def table_of(rows: Sequence[Row], before: dict[str, Row]) -> Table:
     """Return a line for each row and the sums; figures of before stand before arrows."""
     heads = (
-        'plain', 'inliers', 'SLAM', 'lost', 'weak', 'missed', 'wrong', 'plain mm', 'SLAM mm', 's',
+        'plain', 'inliers', 'SLAM', 'lost', 'apart', 'weak', 'missed', 'wrong', 'plain mm', 'SLAM mm', 's',
     )  # fmt: skip
     table = figure_table('recording, variant', *heads)
     for row in rows:
@@ -229,7 +235,7 @@ def table_of(rows: Sequence[Row], before: dict[str, Row]) -> Table:
     table.add_row(f'all {len(rows)}', *map(_arrow, then, _sums(rows)), end_section=True)
     table.caption = (
         'plain: steps placed, of all; inliers: there and needed, medians; SLAM: frames in the map, '
-        'of all; missed: frames of steps that are placed where SLAM has no pose before or after; '
+        'of all; apart: frames in submaps that were left out; missed: frames of steps that are placed where SLAM has no pose before or after; '
         'wrong: where it errs; mm: errors of a step, median and largest; s: CPU time of SLAM'
     )
     return table
@@ -241,6 +247,7 @@ def _figures(row: Row) -> list[str]:
         f'{row.inliers:.0f} {row.needed:.0f}',
         f'{row.tracked}/{row.frames}',
         str(row.lost),
+        str(row.apart),
         str(row.weak),
         str(len(row.missed)),
         str(len(row.wrong)),
@@ -256,7 +263,7 @@ def _sums(rows: Sequence[Row]) -> list[str]:
         f'{sum(row.placed for row in rows)}/{frames - len(rows)}',
         '',
         f'{sum(row.tracked for row in rows)}/{frames}',
-        *(str(sum(getattr(row, name) for row in rows)) for name in ('lost', 'weak')),
+        *(str(sum(getattr(row, name) for row in rows)) for name in ('lost', 'apart', 'weak')),
         *(str(sum(len(getattr(row, name)) for row in rows)) for name in ('missed', 'wrong')),
         '',
         '',

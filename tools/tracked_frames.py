@@ -20,8 +20,8 @@ from segfloor_ros.core.slam.held_results import left_out
 from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE
 from tools.driving import after_sensors, drive
 
-USUAL = ('tracking', 'tracking: the image is the one before; the motion is taken to go on')
-"""States of a frame of which nothing weak is said."""
+UNCERTAIN = 'uncertain'
+"""In the state of a frame whose place is weak."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +48,12 @@ class TrackedFrames:
         """How many frames have a pose of which SLAM itself says that it is weak: uncertain, or by
         sensors alone.
         """
-        return sum(r.tracked and (r.blind or r.state not in USUAL) for r in self.results)
+        return sum(r.tracked and (r.blind or UNCERTAIN in r.state) for r in self.results)
+
+    @property
+    def lost(self) -> int:
+        """How many frames were not even mapped in a submap that was left out."""
+        return sum(not (r.tracked or r.in_submap) for r in self.results)
 
 
 def track_frames(
