@@ -15,10 +15,11 @@ from typing import Annotated, Any, Optional
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.table import Table
 
 from segfloor_ros.apps.cli.main import run_command
-from segfloor_ros.apps.cli.printing import console
+from segfloor_ros.apps.cli.printing import PlainConsole, console
 from segfloor_ros.apps.cli.terminal import Announce, announcing, figure_table
 from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.errors import InputError
@@ -26,15 +27,7 @@ from segfloor_ros.core.files.whole import read_json
 from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.nodes.configuration import resolve
 from tools.plain_tracker import PlainSteps, plain_steps
-from tools.recorded_frames import (
-    CACHE,
-    VARIANTS,
-    Recorded,
-    distance_m,
-    motions,
-    true_poses,
-    vary,
-)
+from tools.recorded_frames import CACHE, VARIANTS, Recorded, distance_m, motions, true_poses, vary
 from tools.tracked_frames import TrackedFrames, track_frames
 
 DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
@@ -108,11 +101,15 @@ def plain_pnp(
     ] = False,
     assignments: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Option('--set', help='One parameter, e.g. stereo_slam.num_features=2000; repeatable.'),
+        typer.Option(
+            '--set', help='One parameter, e.g. stereo_slam.num_features=2000; repeatable.'
+        ),
     ] = None,
     data: Annotated[Path, typer.Option(help='Folder of the recordings.')] = DATA,
     cache: Annotated[Path, typer.Option(help='Folder for frames and plain results.')] = CACHE,
-    fresh: Annotated[bool, typer.Option('--fresh', help='Make the files of the cache anew.')] = False,
+    fresh: Annotated[
+        bool, typer.Option('--fresh', help='Make the files of the cache anew.')
+    ] = False,
     json_file: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option('--json', help='File for the figures.'),
@@ -140,8 +137,8 @@ def plain_pnp(
                 rows.append(row)
                 console.print(_line(row), highlight=False)
                 if json_file:
-                    json_file.write_text(json.dumps([dataclasses.asdict(r) for r in rows], indent=1))
-    console.print(table_of(rows, before), crop=False, width=max(console.width, WIDTH))
+                    write_rows(json_file, rows)
+    PlainConsole(width=max(console.width, WIDTH)).print(table_of(rows, before))
     console.print(f'{time.perf_counter() - start_s:.0f} s', highlight=False)
 
 
@@ -157,7 +154,9 @@ def measure(
     if drive is None:
         return None
     stamps = [frame.stamp_ns for frame in drive.frames]
-    file = recorded.folder / f'plain-{recorded.part}-{variant}.npz'.replace(' ', '_').replace('/', '_')
+    file = recorded.folder / f'plain-{recorded.part}-{variant}.npz'.replace(' ', '_').replace(
+        '/', '_'
+    )
     if file.is_file():
         plain = PlainSteps.read(file)
     else:
@@ -208,7 +207,7 @@ def compare_steps(
     )
 
 
-def is_wrong(plain_m: Array, slam_m: Array, steps_m: Array) -> Array:
+def is_wrong(plain_m: Array, slam_m: Array, steps_m: Array) -> NDArray[np.bool_]:
     """Return where (N,) SLAM errs and the plain method does not, by the errors of their steps and
     the true lengths of those, all (N,) in metres, NaN where they are not known.
     """
@@ -218,25 +217,32 @@ def is_wrong(plain_m: Array, slam_m: Array, steps_m: Array) -> Array:
 
 def rows_by_name(file: Path) -> dict[str, Row]:
     """Return the rows of a file of --json."""
-    rows = [Row(**fields) for fields in read_json(file, 'figures of tools.plain_pnp')]
+    rows = [Row(**fields) for fields in read_json(file, 'figures of tools.plain_pnp')['rows']]
     return {row.name: row for row in rows}
+
+
+def write_rows(file: Path, rows: Sequence[Row]) -> None:
+    """Write rows to a file of --json."""
+    file.write_text(json.dumps({'rows': [dataclasses.asdict(row) for row in rows]}, indent=1))
 
 
 def table_of(rows: Sequence[Row], before: dict[str, Row]) -> Table:
     """Return a line for each row and the sums; figures of before stand before arrows."""
     heads = (
-        'plain', 'inliers', 'SLAM', 'lost', 'apart', 'weak', 'missed', 'wrong', 'plain mm', 'SLAM mm', 's',
+        'plain', 'inliers', 'SLAM', 'lost', 'apart', 'weak', 'missed', 'wrong', 'plain mm',
+        'SLAM mm', 's',
     )  # fmt: skip
     table = figure_table('recording, variant', *heads)
     for row in rows:
         table.add_row(row.name, *_changed(_figures(row), before.get(row.name)))
     common = [before[row.name] for row in rows if row.name in before]
     then = _sums(common) if len(common) == len(rows) else [''] * len(heads)
-    table.add_row(f'all {len(rows)}', *map(_arrow, then, _sums(rows)), end_section=True)
+    table.add_row(f'all {len(rows)}', *map(arrow, then, _sums(rows)), end_section=True)
     table.caption = (
         'plain: steps placed, of all; inliers: there and needed, medians; SLAM: frames in the map, '
-        'of all; apart: frames in submaps that were left out; missed: frames of steps that are placed where SLAM has no pose before or after; '
-        'wrong: where it errs; mm: errors of a step, median and largest; s: CPU time of SLAM'
+        'of all; apart: frames in submaps that were left out; missed: frames of steps that are '
+        'placed where SLAM has no pose before or after; wrong: where it errs; mm: errors of a '
+        'step, median and largest; s: CPU time of SLAM'
     )
     return table
 
@@ -273,10 +279,11 @@ def _sums(rows: Sequence[Row]) -> list[str]:
 
 def _changed(figures: list[str], before: Row | None) -> list[str]:
     then = _figures(before) if before else [''] * len(figures)
-    return list(map(_arrow, then, figures))
+    return list(map(arrow, then, figures))
 
 
-def _arrow(then: str, now: str) -> str:
+def arrow(then: str, now: str) -> str:
+    """Return a figure, and before it what it was, where that is another one."""
     return now if then in ('', now) else f'{then} → {now}'
 
 

@@ -74,7 +74,8 @@ def plain_steps(
     for image, disparity in views:
         keypoints, descriptors = orb.detectAndCompute(image, None)
         uv = np.array([keypoint.pt for keypoint in keypoints], np.float64).reshape(-1, 2)
-        points, pixels = np.zeros((0, 3)), np.zeros((0, 2))
+        points: Array = np.zeros((0, 3))
+        pixels: Array = np.zeros((0, 2))
         if before is not None and len(before[0]) and len(uv):
             pairs = matcher.match(before[1], descriptors)
             points = before[0][[pair.queryIdx for pair in pairs]]

@@ -89,7 +89,7 @@ class Recorded:
         self._every, self._limit = every, limit
         settings = {'input': str(path), 'depth': depth}
         self.source: StereoSource = open_recording(path, resolve(stereo_camera=settings))
-        key = repr((FORMAT, str(path.resolve()), depth, (path / 'times.txt').exists()))
+        key = repr((FORMAT, str(path.resolve()), depth))
         folder = f'{self.name}-{hashlib.sha1(key.encode()).hexdigest()[:8]}'.replace(' ', '_')
         self.folder = cache.expanduser() / folder
         if fresh or not (self.folder / 'stamp_ns.npy').is_file():
@@ -132,7 +132,8 @@ class Recorded:
         return slice(None, self._limit * self._every or None, self._every)
 
     def _stored(self, name: str) -> NDArray[Any]:
-        return np.load(self.folder / f'{name}.npy', mmap_mode='r')  # type: ignore[no-any-return]
+        stored: NDArray[Any] = np.load(self.folder / f'{name}.npy', mmap_mode='r')
+        return stored
 
     def _write(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -197,7 +198,8 @@ def _with_other_images(
 
 
 def in_steps(disparity: NDArray[np.float32], step_px: float) -> NDArray[np.float32]:
-    """Return disparities in steps of so many pixels, NaN where that is 0; a step of 0 changes none.
+    """Return disparities in steps of so many pixels, NaN where that is 0; 0 leaves them as they
+    are.
     """
     if not step_px:
         return np.asarray(disparity)
@@ -303,4 +305,3 @@ def _save(file: Path, arrays: Sequence[Any]) -> None:
     part = file.with_suffix('.part.npy')
     np.save(part, np.array(arrays))
     part.replace(file)
-

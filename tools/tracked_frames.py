@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from segfloor_ros.apps.trajectory import TrackedPose, corrected_trajectory
 from segfloor_ros.core.camera.model import StereoCamera
@@ -39,9 +40,9 @@ class TrackedFrames:
     seconds: float
 
     @property
-    def is_tracked(self) -> Array:
+    def is_tracked(self) -> NDArray[np.bool_]:
         """Which frames (N,) have a pose."""
-        return np.isfinite(self.T_map_left[:, 0, 0])
+        return np.asarray(np.isfinite(self.T_map_left[:, 0, 0]))
 
     @property
     def weak(self) -> int:
@@ -105,7 +106,9 @@ def _corrected(
 ) -> Array:
     """Return the base (N, 4, 4) in `map` by the final keyframes, NaN where it is not tracked."""
     poses = [
-        TrackedPose(r.stamp_ns, r.T_odom_base, r.reference_keyframe_ns, r.T_map_odom @ r.T_odom_base)
+        TrackedPose(
+            r.stamp_ns, r.T_odom_base, r.reference_keyframe_ns, r.T_map_odom @ r.T_odom_base
+        )
         for r in results
         if r.tracked
     ]
