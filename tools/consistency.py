@@ -47,8 +47,9 @@ from tools.recorded_frames import CACHE, Recorded, true_poses
 from tools.tracked_frames import track_frames
 
 WINDOWS_S = 0.1, 1.0, 5.0
-REACH = 0.35
-"""A window may be longer or shorter than it should be by this share."""
+REACH, CUT = 0.35, 0.05
+"""A window may be longer or shorter than it should be by the one share, as the frames have it; at
+the end of the drive shorter by the other."""
 
 RECORDINGS = 'corridor', 'freiburg3_cabinet', 'kitchen', 'kitti06', 'euroc_tiny', 'tumvi'
 SCENES = 'corridor1', 'corridor2', 'ramp', 'rolling'
@@ -225,8 +226,10 @@ def windows(published: Published, window_s: float) -> Array:
     lost = np.concatenate([[0], np.cumsum(~np.isfinite(published.T_odom_left[:, 0, 0]))])
     pairs = []
     for a, time_s in enumerate(times_s):
-        b = int(np.argmin(np.abs(times_s - time_s - window_s)))
-        is_long = abs(times_s[b] - time_s - window_s) <= REACH * window_s
+        longer_s = times_s - time_s - window_s
+        b = int(np.argmin(np.abs(longer_s)))
+        is_cut = b == len(times_s) - 1 and longer_s[b] < -CUT * window_s
+        is_long = abs(longer_s[b]) <= REACH * window_s and not is_cut
         if b > a and is_long and lost[b + 1] == lost[a]:
             pairs.append((a, b))
     return np.array(pairs, int).reshape(-1, 2)

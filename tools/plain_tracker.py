@@ -82,7 +82,7 @@ def plain_steps(
             pixels = uv[[pair.trainIdx for pair in pairs]]
             known = np.isfinite(points[:, 0])
             points, pixels = points[known], pixels[known]
-        rows.append(_place(points, pixels, camera))
+        rows.append(place(points, pixels, camera))
         before = (_points(uv, disparity, camera), descriptors)
     transforms, *counts = zip(*rows, strict=True)
     return PlainSteps(np.array(transforms), *(np.array(count, np.int64) for count in counts))
@@ -154,7 +154,7 @@ def _points(uv: Array, disparity: NDArray[np.float32], camera: StereoCamera) -> 
     return camera.back_project(uv, camera.disparity_times_depth / d)
 
 
-def _place(points: Array, pixels: Array, camera: StereoCamera) -> tuple[Array, int, int, int]:
+def place(points: Array, pixels: Array, camera: StereoCamera) -> tuple[Array, int, int, int]:
     """Return T_now_before (4, 4), the matches, the inliers and how many there must be."""
     lone = distinct(pixels)
     needed = needed_inliers(len(lone), chance_of_match(pixels[lone], camera))

@@ -30,7 +30,7 @@ CACHE = Path('~/.cache/segfloor_tools')
 FORMAT = 1
 """Of the files of the cache; another number makes them anew."""
 
-EXACT_S, DENSE_S = 1e-3, 0.1
+EXACT_S, DENSE_S = 1e-3, 0.12
 """A true pose is that of a frame within the one; between two that are no further apart than the
 other, it is interpolated."""
 
