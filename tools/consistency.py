@@ -30,6 +30,7 @@ import typer
 from rich.table import Table
 from scipy.stats import chi2, norm
 
+import segfloor_ros
 from segfloor_ros.apps.cli.main import run_command
 from segfloor_ros.apps.cli.printing import PlainConsole, console
 from segfloor_ros.apps.cli.terminal import Announce, announcing, figure_table
@@ -157,7 +158,8 @@ def consistency(
                     document = {'rows': [dataclasses.asdict(row) for row in rows]}
                     json_file.write_text(json.dumps(document, indent=1))
     PlainConsole(width=max(console.width, WIDTH)).print(table_of(rows, before))
-    console.print(f'{time.perf_counter() - start_s:.0f} s', highlight=False)
+    took_s = time.perf_counter() - start_s
+    console.print(f'{took_s:.0f} s, with {Path(segfloor_ros.__file__).parent}', highlight=False)
 
 
 def drives(

@@ -18,6 +18,7 @@ import typer
 from numpy.typing import NDArray
 from rich.table import Table
 
+import segfloor_ros
 from segfloor_ros.apps.cli.main import run_command
 from segfloor_ros.apps.cli.printing import PlainConsole, console
 from segfloor_ros.apps.cli.terminal import Announce, announcing, figure_table
@@ -139,7 +140,8 @@ def plain_pnp(
                 if json_file:
                     write_rows(json_file, rows)
     PlainConsole(width=max(console.width, WIDTH)).print(table_of(rows, before))
-    console.print(f'{time.perf_counter() - start_s:.0f} s', highlight=False)
+    took_s = time.perf_counter() - start_s
+    console.print(f'{took_s:.0f} s, with {Path(segfloor_ros.__file__).parent}', highlight=False)
 
 
 def measure(
