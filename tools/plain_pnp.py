@@ -51,11 +51,11 @@ more than `GOOD_M`."""
 @dataclasses.dataclass(frozen=True)
 class Row:
     """One recording in one variant. placed: steps that the plain method places, of frames - 1;
-    needed: the median of the inliers that this takes, inliers: of those there are. tracked: frames
-    of SLAM in the map at the end; apart: in submaps that were left out; lost and weak: what it says
-    itself. missed: frames of placed
-    steps of which SLAM lacks a pose at either end; wrong: where it has both, and errs. Errors: of
-    the steps, in m, where the truth is known. seconds: CPU time of SLAM.
+    good: those that the truth confirms, None without one. inliers, needed: of a step, medians.
+    tracked: frames of SLAM in the map at the end; apart: in submaps that were left out; lost and
+    weak: what it says itself. missed: frames of placed steps of which SLAM lacks a pose at either
+    end; wrong: where it has both, and errs. Errors: of the steps, in m, where the truth is known.
+    seconds: CPU time of SLAM.
     """
 
     recording: str
@@ -76,6 +76,7 @@ class Row:
     slam_max_m: float | None
     keyframes: int
     seconds: float
+    good: int | None
 
     @property
     def name(self) -> str:
@@ -206,15 +207,20 @@ def compare_steps(
         *_median_and_max(slam_m[has_step]),
         slam.keyframes,
         round(slam.seconds, 2),
+        None if true is None else int((placed & is_good(plain_m, steps_m)).sum()),
     )
+
+
+def is_good(plain_m: Array, steps_m: Array) -> NDArray[np.bool_]:
+    """Return where (N,) the plain method errs little, see `is_wrong`."""
+    return np.asarray(plain_m < GOOD_M + GOOD_SHARE * steps_m)
 
 
 def is_wrong(plain_m: Array, slam_m: Array, steps_m: Array) -> NDArray[np.bool_]:
     """Return where (N,) SLAM errs and the plain method does not, by the errors of their steps and
     the true lengths of those, all (N,) in metres, NaN where they are not known.
     """
-    good = plain_m < GOOD_M + GOOD_SHARE * steps_m
-    return np.asarray(good & (slam_m > WORSE * plain_m) & (slam_m > GOOD_M))
+    return np.asarray(is_good(plain_m, steps_m) & (slam_m > WORSE * plain_m) & (slam_m > GOOD_M))
 
 
 def rows_by_name(file: Path) -> dict[str, Row]:
@@ -231,7 +237,7 @@ def write_rows(file: Path, rows: Sequence[Row]) -> None:
 def table_of(rows: Sequence[Row], before: dict[str, Row]) -> Table:
     """Return a line for each row and the sums; figures of before stand before arrows."""
     heads = (
-        'plain', 'inliers', 'SLAM', 'lost', 'apart', 'weak', 'missed', 'wrong', 'plain mm',
+        'plain', 'good', 'inliers', 'SLAM', 'lost', 'apart', 'weak', 'missed', 'wrong', 'plain mm',
         'SLAM mm', 's',
     )  # fmt: skip
     table = figure_table('recording, variant', *heads)
@@ -241,10 +247,10 @@ def table_of(rows: Sequence[Row], before: dict[str, Row]) -> Table:
     then = _sums(common) if len(common) == len(rows) else [''] * len(heads)
     table.add_row(f'all {len(rows)}', *map(arrow, then, _sums(rows)), end_section=True)
     table.caption = (
-        'plain: steps placed, of all; inliers: there and needed, medians; SLAM: frames in the map, '
-        'of all; apart: frames in submaps that were left out; missed: frames of steps that are '
-        'placed where SLAM has no pose before or after; wrong: where it errs; mm: errors of a '
-        'step, median and largest; s: CPU time of SLAM'
+        'plain: steps placed, of all; good: of those, by the truth; inliers: there and needed, '
+        'medians; SLAM: frames in the map, of all; apart: frames in submaps that were left out; '
+        'missed: frames of steps that are placed where SLAM has no pose before or after; wrong: '
+        'where it errs; mm: errors of a step, median and largest; s: CPU time of SLAM'
     )
     return table
 
@@ -252,6 +258,7 @@ def table_of(rows: Sequence[Row], before: dict[str, Row]) -> Table:
 def _figures(row: Row) -> list[str]:
     return [
         f'{row.placed}/{row.frames - 1}',
+        '–' if row.good is None else str(row.good),
         f'{row.inliers:.0f} {row.needed:.0f}',
         f'{row.tracked}/{row.frames}',
         str(row.lost),
@@ -269,6 +276,7 @@ def _sums(rows: Sequence[Row]) -> list[str]:
     frames = sum(row.frames for row in rows)
     return [
         f'{sum(row.placed for row in rows)}/{frames - len(rows)}',
+        '',
         '',
         f'{sum(row.tracked for row in rows)}/{frames}',
         *(str(sum(getattr(row, name) for row in rows)) for name in ('lost', 'apart', 'weak')),
