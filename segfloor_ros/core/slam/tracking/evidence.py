@@ -1,10 +1,11 @@
 """How much measurements say for a pose, against chance.
 
-A match is right with some probability, and then errs by the noise, or it is wrong, and then lies
-anywhere in the area that was searched. The logarithm of the likelihood ratio of the two, summed
-over all matches and averaged over where the camera may be before it looks (Laplace's
+A point that should be in view is found with some probability, and then errs by the noise; or what
+is found is something else, which is rare where little is searched, and lies anywhere in that area.
+The logarithm of the likelihood ratio of the two, summed
+over all points and averaged over where the camera may be before it looks (Laplace's
 approximation: MacKay, Information Theory, Inference, and Learning Algorithms, 2003, chapters 22 and
-28), is the evidence for a pose. Where all matches are wrong, its exponential is 1 on average,
+28), is the evidence for a pose. Where nothing is right, its exponential is 1 on average,
 whatever pose is tried; so it exceeds 1 / p with a probability of at most p (Markov's inequality).
 """
 
@@ -17,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.slam.rig import GATE, Observations
+from segfloor_ros.core.slam.rig import Observations
 
-ENOUGH_EVIDENCE = math.log(GATE / (1.0 - GATE))
-"""Of a pose that is right with a probability of 99.9 %, where right and wrong are as likely before
-anything is seen."""
+ENOUGH_EVIDENCE = math.log(1e6)
+"""Chance gives as much once in a million frames."""
 
 ROUNDS = 4
 """Of the estimate of noise and share of the right matches; it settles by a factor of three each."""
@@ -45,25 +45,27 @@ class Mixture:
     log_ratio: float
 
     @staticmethod
-    def fit(chi2: Array, dimensions: Array, log_chance: Array, factor: float) -> Mixture:
+    def fit(
+        chi2: Array, dimensions: Array, log_chance: Array, factor: float, missed: int = 0
+    ) -> Mixture:
         """Return the likeliest mixture (expectation maximisation: Dempster et al. 1977).
 
         chi2: (N,) squared residuals over what the noise is announced to be. dimensions: (N,) of
-        each. log_chance: (N,) logarithm of the area that was searched over that of the noise.
-        factor: of the noise, to begin with.
+        each. log_chance: (N,) logarithm of what is searched over what the noise fills. factor: of
+        the noise, to begin with. missed: how many more were looked for, and gave no match.
         """
         share, known = 0.5, KNOWN_AS
         for _ in range(ROUNDS):
             log_right = log_chance - dimensions * math.log(factor) - chi2 / (2 * factor**2)
             right = share * np.exp(np.minimum(log_right, 700.0))
             probability = right / (1.0 - share + right)
-            share = float((probability.sum() + 0.5) / (len(chi2) + 1.0))
+            share = float((probability.sum() + 0.5) / (len(chi2) + missed + 1.0))
             total = float(probability @ np.where(probability > 0, chi2, 0.0))
             variance = (known + total) / (known + float(probability @ dimensions))
             factor = math.sqrt(max(variance, 1.0))
         log_right = log_chance - dimensions * math.log(factor) - chi2 / (2 * factor**2)
         right = share * np.exp(np.minimum(log_right, 700.0))
-        log_ratio = float(np.log(1.0 - share + right).sum())
+        log_ratio = float(np.log(1.0 - share + right).sum() + missed * math.log(1.0 - share))
         return Mixture(factor, share, right / (1.0 - share + right), log_ratio)
 
 

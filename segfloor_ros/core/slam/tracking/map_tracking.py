@@ -64,6 +64,10 @@ NARROW_PX, USUAL_PX, WIDE_PX = 6.0, 15.0, 45.0
 """Search radius around a predicted pixel, at the finest pyramid level: once a pose is known from
 this very frame; by a prediction; and when that finds too little."""
 
+FOUND_PER_PX, ALIGNED = 1 / 300, 0.015
+"""Probability, for each pixel of the radius, that a feature is found where the point is not, and
+that a patch is aligned there: measured at poses that are wrong by 5 to 10 degrees."""
+
 Pixels = Images | Observations
 """What the features of a frame are measured in: its images, or where these are gone, as of a saved
 keyframe, what was measured in them."""
@@ -161,7 +165,8 @@ class Tracker:
         measured = observations.take(rows).without_offset(offset_px)
         found = None
         if not is_given:
-            searched = searched_in(area_px2, images, measured)
+            missed, by_chance = len(seen.ids) - len(rows), NARROW_PX * FOUND_PER_PX
+            searched = Searched(area_px2, range_of(images, measured), missed, by_chance)
             found = self.consensus.refine(T_camera_world, ids, measured, searched, known)
         if found is None or not is_proof(found.evidence(known)):
             if known is None:
@@ -212,8 +217,10 @@ class Tracker:
         points, rows, area_px2 = self._search(features, tree, seen, start.radius_px)
         if len(rows) == 0:
             return None
+        missed, by_chance = len(seen.ids) - len(rows), min(start.radius_px * FOUND_PER_PX, 1.0)
+        searched = Searched(area_px2, None, missed, by_chance)
         found = self.consensus.refine(
-            start.T_camera_world, seen.ids[points], observations.take(rows), Searched(area_px2)
+            start.T_camera_world, seen.ids[points], observations.take(rows), searched
         )
         return found if is_proof(found.evidence()) else None
 
@@ -246,15 +253,15 @@ class Start:
     is_sure: bool = False
 
 
-def searched_in(area_px2: Array | float, images: Pixels, measured: Observations) -> Searched:
-    """Return where points were looked for: disparities near a guess, but of a depth camera it takes
-    those that come.
+def range_of(images: Pixels, measured: Observations) -> float:
+    """Return the range of disparities in which a wrong one may lie: near a guess; of a depth camera
+    it takes those that come.
     """
-    range_px = 2 * ALIGNED_PX
+    near_px = 2 * ALIGNED_PX
     disparity = measured.uvd_px[measured.has_disparity, 2]
-    if len(disparity) and not (isinstance(images, Images) and not images.depth_scale):
-        range_px = max(range_px, float(np.ptp(disparity)))
-    return Searched(area_px2, range_px)
+    if len(disparity) == 0 or (isinstance(images, Images) and not images.depth_scale):
+        return near_px
+    return max(near_px, float(np.ptp(disparity)))
 
 
 @dataclass(frozen=True)
@@ -446,7 +453,9 @@ class Follower:
             return None
         ids = seen.ids[rows]
         measured = observations.take(rows)
-        searched = searched_in(4 * ALIGNED_PX**2, images, measured)
+        searched = Searched(
+            4 * ALIGNED_PX**2, range_of(images, measured), len(seen.ids) - len(rows), ALIGNED
+        )
         found = self._consensus.refine(pose, ids, measured.without_offset(offset_px), searched)
         return Track(found, ids[found.inliers], measured.take(found.inliers), seen.ids)
 

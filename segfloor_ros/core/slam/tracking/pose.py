@@ -78,11 +78,14 @@ PROVEN = math.log(PROOF)
 @dataclass(frozen=True)
 class Searched:
     """Where matches were looked for. area_px2: (N,) or one for all. range_px: of disparities.
-    None: the whole image.
+    None: the whole image. missed: how many points more were looked for, and not found. by_chance:
+    the probability to find something where the point is not.
     """
 
     area_px2: Array | float | None = None
     range_px: float | None = None
+    missed: int = 0
+    by_chance: float = 1.0
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Searched:
         """Return that of the chosen matches."""
@@ -93,7 +96,7 @@ class Searched:
         """Return the logarithm (N,) of where a wrong match may lie over where a right one may."""
         area = camera.width * camera.height if self.area_px2 is None else self.area_px2
         range_px = MAX_DISPARITY_SHARE * camera.width if self.range_px is None else self.range_px
-        return log_chance_of(observations, area, range_px)
+        return log_chance_of(observations, area, range_px) - math.log(self.by_chance)
 
 
 WHOLE = Searched()
@@ -187,7 +190,7 @@ def refine_pose(
         rays, _, chi2 = seen.at(pose)
         chi2[rays[2] >= 1 / MIN_DEPTH_M] = 1e12
         start = 1.0 if is_noise_known else math.sqrt(max(1.0, float(np.median(chi2 / seen.median))))
-        mixture = Mixture.fit(chi2, seen.dimensions, log_chance, start)
+        mixture = Mixture.fit(chi2, seen.dimensions, log_chance, start, searched.missed)
         factor = 1.0 if is_noise_known else mixture.factor
         before, inliers = inliers, chi2 <= factor**2 * seen.limit
         is_enough = prior is not None or inliers.sum() >= 4
