@@ -109,8 +109,9 @@ class Tracker:
         expected: PoseEstimate | None,
     ) -> Track | None:
         """Return the pose of a frame with the most evidence, of those found from some starts, tried
-        in order until one is proven and is where the camera was expected; its observations have the
-        disparity offset. None where nothing is proven.
+        in order until two lead to the same, or one that must be near is proven and is where the
+        camera was expected; its observations have the disparity offset. None where nothing is
+        proven.
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
@@ -124,9 +125,11 @@ class Tracker:
             track = self.track_at(images, features, local_ids, coarse.T_camera_world)
             if track is None:
                 continue
+            proven = is_proof(track.evidence(expected))
+            is_found_again = best is not None and proven and track.fits(best.estimate)
             if best is None or track.evidence(expected) > best.evidence(expected):
                 best = track
-            if start.is_sure and is_proof(track.evidence(expected)) and track.fits(expected):
+            if is_found_again or (start.is_sure and proven and track.fits(expected)):
                 break
         return best if best is not None and is_proof(best.evidence(expected)) else None
 
