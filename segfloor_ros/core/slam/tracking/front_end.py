@@ -23,10 +23,12 @@ from segfloor_ros.core.slam.places.place_recognition import (
     greatest_speed_mps,
     is_within,
 )
+from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.thresholds import MOST, SAME
 from segfloor_ros.core.slam.tracking.evidence import is_proof
+from segfloor_ros.core.slam.tracking.frame_to_frame import FrameToFrame
 from segfloor_ros.core.slam.tracking.images import FeatureExtractor, Features, Images, is_inside
 from segfloor_ros.core.slam.tracking.map_tracking import (
     USUAL_PX,
@@ -63,6 +65,7 @@ class FrontEnd:
         self.motion = CameraMotion(body)
         self.local = LocalMap(sparse_map, settings.keyframe_max_frames)
         self.follower = Follower(sparse_map)
+        self.frame_to_frame = FrameToFrame(sparse_map.rig, settings.fast_threshold)
         self.tracker = Tracker(sparse_map)
         self.extractor = FeatureExtractor(settings)
         self.places = PlaceRecognition(sparse_map)
@@ -85,6 +88,7 @@ class FrontEnd:
         """Begin anew in a map in which the camera must be found."""
         self.local.point_ids = np.zeros(0, np.int32)
         self.follower.reset()
+        self.frame_to_frame.reset()
         self.relocaliser.reset()
         self.motion.lose()
 
@@ -150,6 +154,9 @@ class FrontEnd:
         track = self._weighed(replace(track, prior=self.motion.prior(frame.stamp_ns)))
         self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
         self.follower.see(images, track.point_ids, track.uv_px)
+        self.frame_to_frame.see(frame, images, track.estimate)
+        if len(track.point_ids) == 0:
+            self.motion.since_keyframe.see(track.T_camera_world, track.covariance)
         self.local.move_to(track.point_ids, track.T_camera_world)
         if not self.is_fixed:
             self._map.points.note_tracking(track.visible_ids, track.point_ids)
@@ -170,15 +177,20 @@ class FrontEnd:
         if followed is not None and followed.fits(expected) and reach_px < WIDE_PX:
             return followed
         features = self.extractor.extract(frame.left, images.excluded)
-        starts = self._starts(frame, features, followed, reach_px)
+        starts = self._starts(frame, images, features, followed, reach_px)
         found = self.tracker.best(images, features, self.local.point_ids, starts, expected)
         found = followed if found is None else found
         if found is None and self.motion.state is not TrackingState.TRACKING:
             return self._relocalise(images, features, frame.stamp_ns)
-        return found
+        return self._stepped(frame, images) if found is None else found
 
     def _starts(
-        self, frame: StereoFrame, features: Features, followed: Track | None, reach_px: float
+        self,
+        frame: StereoFrame,
+        images: Images,
+        features: Features,
+        followed: Track | None,
+        reach_px: float,
     ) -> Iterator[Start]:
         """Yield where the camera may be, what costs least first. reach_px: up to which points may
         be elsewhere than expected.
@@ -191,8 +203,20 @@ class FrontEnd:
         located = self.tracker.by_descriptors(features, self.local.point_ids)
         if located is not None:
             yield located
+        stepped = self.frame_to_frame.find(frame, images)
+        if stepped is not None:
+            yield Start(stepped.T_camera_world)
         yield from (Start(T_camera_world) for T_camera_world in predictions)
         yield Start(predictions[0], WIDE_PX)
+
+    def _stepped(self, frame: StereoFrame, images: Images) -> Track | None:
+        """Return the pose by the frame before alone: it shows no point of the map."""
+        estimate = self.frame_to_frame.find(frame, images)
+        if estimate is None:
+            return None
+        none = np.zeros(0, np.int32)
+        nothing = Observations(np.zeros((0, 3)), np.zeros((0, 3)))
+        return Track(replace(estimate, inliers=np.zeros(0, bool)), none, nothing, none)
 
     def _weighed(self, track: Track) -> Track:
         """Return a track with the likeliest pose by images and prior; that of the images where the
@@ -265,7 +289,7 @@ class FrontEnd:
             observed = track.observed.take(np.flatnonzero(~inside))
             return observed
         features = self.extractor.extract(frame.left, images.excluded)
-        if track is None:
+        if track is None or len(track.point_ids) == 0:
             if not self._map.keyframes:
                 self.motion.take(self.motion.T_camera_world, np.zeros((6, 6)), frame.stamp_ns)
             none = np.full(len(features), NO_POINT, np.int32)

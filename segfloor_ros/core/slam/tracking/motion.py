@@ -317,14 +317,21 @@ class KeyframeMotion:
         self.motion: RelativeMotion | None = None
 
     def start(self, T_camera_world: Array, covariance: Array) -> RelativeMotion | None:
-        """Begin at a keyframe; returns the motion before it, if wheels measured it."""
+        """Begin at a keyframe; returns the motion before it, if wheels measured it, or images
+        alone without the map."""
         before, self.motion = self.motion, RelativeMotion.none()
         self.T_camera_world, self.covariance = T_camera_world, covariance
-        return before if before is not None and before.by_wheels else None
+        return before if before is not None and before.source in ('wheels', 'images') else None
 
     def add(self, measured: RelativeMotion | None) -> None:
         """Add the motion of a frame."""
         self.motion = joined_motion(self.motion, measured) if self.motion and measured else None
+
+    def see(self, T_camera_world: Array, covariance: Array) -> None:
+        """Take in a pose (4, 4) that images show without the map, with its covariance (6, 6)."""
+        if self.motion is None or not self.motion.by_wheels:
+            T_now_keyframe = T_camera_world @ invert(self.T_camera_world)
+            self.motion = RelativeMotion(T_now_keyframe, covariance, 'images')
 
     def moved(self, measured: RelativeMotion) -> tuple[Array, Array] | None:
         """Return the pose after the motion by wheels so far and one of a frame, with covariance."""
