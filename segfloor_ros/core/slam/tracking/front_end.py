@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from segfloor_ros.core.camera.model import StereoCamera, is_disparity
 from segfloor_ros.core.camera.pixels import Region, union
 from segfloor_ros.core.contracts import NO_POINT, BodySensors, LastPose, StereoFrame
-from segfloor_ros.core.geometry import Array, transform_points
+from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.places.place_recognition import (
     PlaceRecognition,
     Relocaliser,
@@ -110,6 +110,7 @@ class FrontEnd:
     def follow_map(self, T_reference_before: Array, T_reference_after: Array) -> None:
         """Move along with a keyframe (T_camera_world, (4, 4)) that the map has moved."""
         self.motion.move_map(T_reference_before, T_reference_after)
+        self.frame_to_frame.move_map(invert(T_reference_before) @ T_reference_after)
         self.drop_dead()
 
     def drop_dead(self) -> None:
@@ -181,7 +182,7 @@ class FrontEnd:
         found = self.tracker.best(images, features, self.local.point_ids, starts, expected)
         found = followed if found is None else found
         if found is None and self.motion.state is not TrackingState.TRACKING:
-            return self._relocalise(images, features, frame.stamp_ns)
+            found = self._relocalise(images, features, frame.stamp_ns)
         return self._stepped(frame, images) if found is None else found
 
     def _starts(

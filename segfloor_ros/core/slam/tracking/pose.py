@@ -130,7 +130,10 @@ class PoseEstimate:
 
 
 def solve_pnp(
-    camera: StereoCamera, points_world: Array, uv_px: NDArray[np.floating]
+    camera: StereoCamera,
+    points_world: Array,
+    uv_px: NDArray[np.floating],
+    iterations: int = RANSAC_ITERATIONS,
 ) -> tuple[Array, NDArray[np.bool_]] | None:
     """Find T_camera_world from points (N, 3) and pixels (N, 2) by PnP in RANSAC, or None.
 
@@ -145,7 +148,7 @@ def solve_pnp(
         np.ascontiguousarray(uv_px, np.float64),
         camera.K,
         None,
-        iterationsCount=RANSAC_ITERATIONS,
+        iterationsCount=iterations,
         reprojectionError=SAME_PX,
         confidence=0.999,
         flags=cv2.SOLVEPNP_AP3P,
@@ -166,6 +169,7 @@ def refine_pose(
     prior: PoseEstimate | None = None,
     searched: Searched = WHOLE,
     is_noise_known: bool = False,
+    first: NDArray[np.bool_] | None = None,
 ) -> PoseEstimate:
     """Refine a pose by Levenberg-Marquardt on (u, v, d) with a Huber cost, dropping outliers
     between rounds.
@@ -174,10 +178,10 @@ def refine_pose(
     and a poor calibration make errors larger than the sigmas of single measurements; a mixture of
     right and wrong matches shows by how much, and the bound on outliers follows it, unless the
     noise is known. prior: the pose by other sensors; it adds what the points do not determine.
-    searched: where the matches were looked for.
+    searched: where the matches were looked for. first: which (N,) agree with the pose at the start.
     """
     seen = _Seen.of(camera, points_world, observations)
-    inliers = np.ones(len(points_world), bool)
+    inliers = np.ones(len(points_world), bool) if first is None else first
     if prior is not None and not len(points_world):
         return replace(prior, inliers=inliers)
     known = _Prior() if prior is None else _Prior.of(prior)
