@@ -24,7 +24,7 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     adjust,
     gather,
 )
-from segfloor_ros.core.slam.mapping.normal_equations import factors_of
+from segfloor_ros.core.slam.mapping.normal_equations import factors_of, motion_before
 from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, SAME_PX
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, ENOUGH, MAJORITY, NEARLY_ALL, PROOF
@@ -205,7 +205,8 @@ class LocalMapper:
         around, _ = self._map.covisible(self._map.points_of(free))
         if keyframe.motion is not None:
             # What wheels tie to the oldest that moves holds it.
-            around = np.append(around, max(int(free.min()) - 1, 0))
+            before, _ = motion_before(self._map.keyframes, int(free.min()))
+            around = np.append(max(before, 0), around)
         fixed = around[~np.isin(around, free)][: NEIGHBOURS - LOCAL_KEYFRAMES]
         if len(fixed) == 0:
             fixed, free = free[-1:], free[:-1]
@@ -225,10 +226,11 @@ class LocalMapper:
 def _linked(sparse_map: SparseMap, keyframe: KeyframeRecord) -> NDArray[np.intp]:
     """Return the keyframes before one that wheels tie to it without a gap, the oldest first."""
     linked: list[int] = []
-    while keyframe.motion is not None and len(linked) < LOCAL_KEYFRAMES - 1:
-        keyframe = sparse_map.keyframes[keyframe.index - 1]
-        if keyframe.retired is None:
-            linked.append(keyframe.index)
+    while len(linked) < LOCAL_KEYFRAMES - 1:
+        before, motion = motion_before(sparse_map.keyframes, (linked or [keyframe.index])[-1])
+        if motion is None:
+            break
+        linked.append(before)
     return np.array(linked[::-1], np.intp)
 
 

@@ -44,7 +44,7 @@ from segfloor_ros.core.slam.tracking.motion import (
     TrackingState,
     sigma_m,
 )
-from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE
+from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE, with_patch_noise
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ, knows_more, refine_pose
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
@@ -147,12 +147,15 @@ class FrontEnd:
             track = self._relocalise(images, features, frame.stamp_ns, found)
         else:
             track = self._followed(frame, images, expected)
-        if track is None:
+        prior = self.motion.prior(frame.stamp_ns)
+        knows_less = track is not None and self._knows_less(track, expected, frame.stamp_ns)
+        # Images that know less than the sensors, and contradict them, show something else.
+        if track is None or (knows_less and not (track.fits(expected) and track.fits(prior))):
             self.follower.reset()
             return None
         track = replace(track, sigma_m=sigma_m(track.covariance))
-        T_seen = track.T_camera_world
-        track = self._weighed(replace(track, prior=self.motion.prior(frame.stamp_ns)))
+        T_seen = None if knows_less else track.T_camera_world
+        track = self._weighed(replace(track, prior=prior, is_weak=knows_less))
         self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
         self.follower.see(images, track.point_ids, track.uv_px)
         self.frame_to_frame.see(frame, images, track.estimate)
@@ -163,6 +166,15 @@ class FrontEnd:
             self._map.points.note_tracking(track.visible_ids, track.point_ids)
         self.frames_since_keyframe += 1
         return track
+
+    def _knows_less(self, track: Track, expected: PoseEstimate | None, stamp_ns: int) -> bool:
+        """Whether sensors know some direction of the motion since the last pose better than the
+        images.
+        """
+        measured = None if self.motion.state.is_lost else self.motion.measured(stamp_ns)
+        if expected is None or measured is None:
+            return False
+        return knows_more(measured.covariance, track.estimate)
 
     def _followed(
         self, frame: StereoFrame, images: Images, expected: PoseEstimate | None
@@ -225,9 +237,8 @@ class FrontEnd:
         """
         prior = track.prior
         if prior is None or differ(track.estimate, prior):
-            return replace(track, prior=None, is_prior_better=False)
-        fused = _with_prior(self._map, track, prior)
-        return replace(track, estimate=fused, is_prior_better=knows_more(prior, fused))
+            return replace(track, prior=None)
+        return replace(track, estimate=_with_prior(self._map, track, prior))
 
     def bridge(self, frame: StereoFrame, fault: str) -> None:
         """Go on without the images, where the sensors allow it."""
@@ -288,7 +299,7 @@ class FrontEnd:
         if track is not None and track.observed is not None:
             inside = is_inside(images.excluded, track.observed.features.uv_px)
             observed = track.observed.take(np.flatnonzero(~inside))
-            return observed
+            return _by_patches(images, observed) if track.is_weak else observed
         features = self.extractor.extract(frame.left, images.excluded)
         if track is None or len(track.point_ids) == 0:
             if not self._map.keyframes:
@@ -303,9 +314,10 @@ class FrontEnd:
             return None
         assert matched.observed is not None
         weighed = self._weighed(replace(matched, prior=track.prior))
-        self.motion.T_camera_world = weighed.T_camera_world
+        if not (track.is_weak and track.prior is not None and weighed.prior is None):
+            self.motion.T_camera_world = weighed.T_camera_world
         self._map.points.note_tracking(matched.visible_ids, matched.point_ids)
-        return matched.observed
+        return _by_patches(images, matched.observed) if track.is_weak else matched.observed
 
     def continue_from(self, images: Images, keyframe: KeyframeRecord) -> None:
         """Track on from the points of a keyframe, old and new."""
@@ -324,6 +336,13 @@ def _with_prior(sparse_map: SparseMap, track: Track, prior: PoseEstimate) -> Pos
     start, camera = by_images.T_camera_world, sparse_map.rig.camera
     found = refine_pose(camera, start, points, seen, prior, is_noise_known=True)
     return replace(by_images, T_camera_world=found.T_camera_world, covariance=found.covariance)
+
+
+def _by_patches(images: Images, observed: ObservedFeatures) -> ObservedFeatures:
+    """Return the features of a frame that shows little, as sure as their patches are."""
+    is_matched = not images.depth_scale
+    observations = with_patch_noise(images.left, observed.observations, is_matched)
+    return replace(observed, observations=observations)
 
 
 def is_near(T_camera_world: Array, expected: PoseEstimate | None) -> bool:

@@ -181,8 +181,9 @@ class CameraMotion:
         self, T_camera_world: Array, covariance: Array, stamp_ns: int, T_seen: Array | None = None
     ) -> None:
         """Go on from the pose of a frame, found in its images. T_seen: (4, 4), as the images alone
-        have it: the sensors learn from that. After a blind stretch `odom` goes on where the sensors
-        had the camera: the error of the stretch is a correction of `odom`.
+        have it, where they know it better than the sensors: these learn from that. After a blind
+        stretch `odom` goes on where the sensors had the camera: the error of the stretch is a
+        correction of `odom`.
         """
         measured = self.measured(stamp_ns)
         predicted = self._predicted(measured)
@@ -199,9 +200,13 @@ class CameraMotion:
         self.T_camera_world, self.covariance = T_camera_world, covariance
         self._last_stamp_ns = stamp_ns
         self.state = TrackingState.TRACKING
-        T_seen = T_camera_world if T_seen is None else T_seen
-        T_odom_seen = invert(self.T_world_odom) @ invert(T_seen)
-        self._body.learn(stamp_ns, T_odom_seen, self.T_world_odom[:3, :3])
+        R_world_odom = self.T_world_odom[:3, :3]
+        if T_seen is not None or measured is None:
+            T_seen = T_camera_world if T_seen is None else T_seen
+            T_odom_seen = invert(self.T_world_odom) @ invert(T_seen)
+            self._body.learn(stamp_ns, T_odom_seen, R_world_odom)
+        else:
+            self._body.carry(stamp_ns, self.T_odom_camera, R_world_odom, measured.by_wheels)
 
     def bridge(self, stamp_ns: int) -> bool:
         """Go on without the images to where the sensors have the camera. Returns whether they

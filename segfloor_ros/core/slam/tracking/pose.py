@@ -358,13 +358,13 @@ class _State:
         return stepped
 
 
-def knows_more(prior: PoseEstimate, fused: PoseEstimate) -> bool:
-    """Whether a prior knows some direction of a pose better than the points with which it was
-    fused.
+def knows_more(covariance: Array, by_images: PoseEstimate) -> bool:
+    """Whether sensors, with the covariance (6, 6) of what they measure, know some direction of a
+    pose better than the images.
     """
-    known = np.linalg.inv(prior.covariance)
-    by_points = np.linalg.inv(fused.covariance) - known + np.diag(FIRST_INFORMATION)
-    return bool(np.linalg.eigvals(np.linalg.solve(by_points, known)).real.max() > 1)
+    known = np.linalg.inv(covariance + SMALLEST * np.eye(6))
+    seen = np.linalg.inv(by_images.covariance) + np.diag(FIRST_INFORMATION)
+    return bool(np.linalg.eigvals(np.linalg.solve(seen, known)).real.max() > 1)
 
 
 class Consensus:
