@@ -62,7 +62,7 @@ class FrontEnd:
     def __init__(
         self, settings: StereoSlamSettings, sparse_map: SparseMap, body: BodySensors
     ) -> None:
-        self.motion = CameraMotion(body)
+        self.motion = CameraMotion(settings.max_speed_mps, body)
         self.local = LocalMap(sparse_map, settings.keyframe_max_frames)
         self.follower = Follower(sparse_map)
         self.frame_to_frame = FrameToFrame(sparse_map.rig, settings.fast_threshold)
@@ -147,6 +147,8 @@ class FrontEnd:
             track = self._relocalise(images, features, frame.stamp_ns, found)
         else:
             track = self._followed(frame, images, expected)
+        if track is not None and not self.motion.is_plausible(track.T_camera_world, frame.stamp_ns):
+            track = None
         prior = self.motion.prior(frame.stamp_ns)
         knows_less = track is not None and self._knows_less(track, expected, frame.stamp_ns)
         # Images that know less than the sensors, and contradict them, show something else.

@@ -20,12 +20,15 @@ from segfloor_ros.core.geometry import Array, invert, make_transform, rotation_f
 from segfloor_ros.core.slam.thresholds import SAME, SPEED_SIGMA
 from segfloor_ros.core.slam.tracking.images import SMALL_WIDTH_PX
 from segfloor_ros.core.slam.tracking.pose import ANYWHERE, PoseEstimate
-from segfloor_ros.core.twists import adjoint, se3_exp, se3_log, without_drift
+from segfloor_ros.core.twists import adjoint, is_within, se3_exp, se3_log, without_drift
 
 MIN_STEP_S = 1e-3
 
 MIN_RESPONSE = 0.05
 """Of the phase correlation of two images that have something in common."""
+
+MAX_TURN_RADPS = 6.0
+"""A robot does not spin faster than once a second."""
 
 ACCELERATION = 2.0
 """Of a robot on wheels, m/s² and rad/s², until its motion shows another one."""
@@ -74,8 +77,9 @@ class CameraMotion:
     while it is lost, `T_camera_world` turns on as a gyroscope measures.
     """
 
-    def __init__(self, body: BodySensors) -> None:
+    def __init__(self, max_speed_mps: float, body: BodySensors) -> None:
         self._body = body
+        self._max_speed_mps = max_speed_mps
         self.reset()
 
     def reset(self) -> None:
@@ -143,6 +147,16 @@ class CameraMotion:
         if not measured.by_wheels:
             covariance[:3, :3] += (SPEED_SIGMA * step_s) ** 2 * np.eye(3)
         return _estimate(pose, covariance)
+
+    def is_plausible(self, T_camera_world: Array, stamp_ns: int) -> bool:
+        """Whether a robot can have come to a pose since the last frame; of a lost one nothing is
+        known.
+        """
+        if self.state.is_lost or self.state.is_resuming:
+            return True
+        motion = T_camera_world @ invert(self.T_camera_world)
+        step_s = _step_s(self._last_stamp_ns, stamp_ns)
+        return is_within(motion, (self._max_speed_mps * step_s, MAX_TURN_RADPS * step_s))
 
     def _expected_lost(self, stamp_ns: int) -> PoseEstimate | None:
         turned = self._turned(stamp_ns)
