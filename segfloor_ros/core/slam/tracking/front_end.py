@@ -38,12 +38,7 @@ from segfloor_ros.core.slam.tracking.map_tracking import (
     Start,
     Tracker,
 )
-from segfloor_ros.core.slam.tracking.motion import (
-    CameraMotion,
-    ImageRotation,
-    TrackingState,
-    sigma_m,
-)
+from segfloor_ros.core.slam.tracking.motion import CameraMotion, TrackingState, sigma_m
 from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE, with_patch_noise
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ, knows_more, refine_pose
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
@@ -75,7 +70,6 @@ class FrontEnd:
         self._map = sparse_map
         self.relocaliser = Relocaliser(sparse_map, self.places)
         self.repeats = RepeatCheck()
-        self._rotation = ImageRotation(self._camera)
 
     @property
     def is_searching(self) -> bool:
@@ -140,7 +134,6 @@ class FrontEnd:
         """Find the pose of a frame: from the one before, else by its features. found: where
         it is in this map, as that was found while the camera was in a submap.
         """
-        self._rotation.see(images.small)
         expected = self.motion.expected(frame.stamp_ns)
         if found is not None:
             features = self.extractor.extract(frame.left, images.excluded)
@@ -195,9 +188,29 @@ class FrontEnd:
         starts = self._starts(frame, images, features, followed, reach_px)
         found = self.tracker.best(images, features, self.local.point_ids, starts, expected)
         found = followed if found is None else found
+        if found is not None and expected is not None and reach_px < WIDE_PX:
+            found = self._standing(images, features, found, expected)
         if found is None and self.motion.state is not TrackingState.TRACKING:
             found = self._relocalise(images, features, frame.stamp_ns)
         return self._stepped(frame, images) if found is None else found
+
+    def _standing(
+        self, images: Images, features: Features, found: Track, expected: PoseEstimate
+    ) -> Track:
+        """Return, of a pose that was found and one near where it was expected, the likelier by the
+        records of their points of standing still: what comes close and fills the image has the most
+        points.
+        """
+        pose, around = expected.T_camera_world, self.local.point_ids
+        steady = self.tracker.track_at(images, features, around, pose)
+        if steady is None:
+            return found
+        of_steady, of_found = (
+            self.tracker.consensus.record(t.point_ids, t.T_camera_world).sum()
+            - t.estimate.surprise(expected)
+            for t in (steady, found)
+        )
+        return steady if of_steady > of_found else found
 
     def _starts(
         self,
@@ -252,10 +265,9 @@ class FrontEnd:
 
     def _predict_poses(self, frame: StereoFrame) -> list[Array]:
         """Return where the camera may be now, T_camera_world (4, 4) each, the likeliest first."""
-        turned = self._rotation.turn_since_last() @ self.motion.T_camera_world
         steady = self.motion.steady(frame.stamp_ns)
         measured = self.motion.measured_pose(frame.stamp_ns)
-        return [steady, turned] if measured is None else [measured, steady, turned]
+        return [steady] if measured is None else [measured, steady]
 
     def _relocalise(
         self, images: Images, features: Features, stamp_ns: int, found: Track | None = None
