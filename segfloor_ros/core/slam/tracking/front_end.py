@@ -40,7 +40,7 @@ from segfloor_ros.core.slam.tracking.map_tracking import (
 )
 from segfloor_ros.core.slam.tracking.motion import CameraMotion, TrackingState, sigma_m
 from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE, with_patch_noise
-from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ, knows_more, refine_pose
+from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ, refine_pose
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
 
@@ -143,7 +143,7 @@ class FrontEnd:
         if track is not None and not self.motion.is_plausible(track.T_camera_world, frame.stamp_ns):
             track = None
         prior = self.motion.prior(frame.stamp_ns)
-        knows_less = track is not None and self._knows_less(track, expected, frame.stamp_ns)
+        knows_less = track is not None and self.motion.knows_more(track.estimate, frame.stamp_ns)
         # Images that know less than the sensors, and contradict them, show something else.
         if track is None or (knows_less and not (track.fits(expected) and track.fits(prior))):
             self.follower.reset()
@@ -161,15 +161,6 @@ class FrontEnd:
             self._map.points.note_tracking(track.visible_ids, track.point_ids)
         self.frames_since_keyframe += 1
         return track
-
-    def _knows_less(self, track: Track, expected: PoseEstimate | None, stamp_ns: int) -> bool:
-        """Whether sensors know some direction of the motion since the last pose better than the
-        images.
-        """
-        measured = None if self.motion.state.is_lost else self.motion.measured(stamp_ns)
-        if expected is None or measured is None:
-            return False
-        return knows_more(measured.covariance, track.estimate)
 
     def _followed(
         self, frame: StereoFrame, images: Images, expected: PoseEstimate | None
@@ -223,7 +214,10 @@ class FrontEnd:
         """Yield where the camera may be, what costs least first. reach_px: up to which points may
         be elsewhere than expected.
         """
-        predictions = self._predict_poses(frame)
+        measured = self.motion.measured_pose(frame.stamp_ns)
+        predictions = [self.motion.steady(frame.stamp_ns)]
+        if measured is not None:
+            predictions.insert(0, measured)
         if reach_px < WIDE_PX:
             yield Start(predictions[0], max(reach_px, USUAL_PX), is_sure=True)
         if followed is not None:
@@ -262,12 +256,6 @@ class FrontEnd:
             self.frames_since_keyframe += 1
         elif not fault or self.motion.state is not TrackingState.TRACKING:
             self.motion.lose(frame.stamp_ns)
-
-    def _predict_poses(self, frame: StereoFrame) -> list[Array]:
-        """Return where the camera may be now, T_camera_world (4, 4) each, the likeliest first."""
-        steady = self.motion.steady(frame.stamp_ns)
-        measured = self.motion.measured_pose(frame.stamp_ns)
-        return [steady] if measured is None else [measured, steady]
 
     def _relocalise(
         self, images: Images, features: Features, stamp_ns: int, found: Track | None = None

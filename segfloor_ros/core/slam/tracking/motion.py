@@ -9,7 +9,7 @@ import numpy as np
 from segfloor_ros.core.contracts import BodySensors, LastPose, RelativeMotion
 from segfloor_ros.core.geometry import Array, invert, make_transform
 from segfloor_ros.core.slam.thresholds import SAME, SPEED_SIGMA
-from segfloor_ros.core.slam.tracking.pose import ANYWHERE, PoseEstimate
+from segfloor_ros.core.slam.tracking.pose import ANYWHERE, PoseEstimate, knows_more
 from segfloor_ros.core.twists import adjoint, is_within, se3_exp, se3_log, without_drift
 
 MIN_STEP_S = 1e-3
@@ -144,6 +144,13 @@ class CameraMotion:
         motion = T_camera_world @ invert(self.T_camera_world)
         step_s = _step_s(self._last_stamp_ns, stamp_ns)
         return is_within(motion, (self._max_speed_mps * step_s, MAX_TURN_RADPS * step_s))
+
+    def knows_more(self, by_images: PoseEstimate, stamp_ns: int) -> bool:
+        """Whether sensors know some direction of the motion since the last pose better than the
+        images.
+        """
+        measured = None if self.state.is_lost else self.measured(stamp_ns)
+        return measured is not None and knows_more(measured.covariance, by_images)
 
     def _expected_lost(self, stamp_ns: int) -> PoseEstimate | None:
         turned = self._turned(stamp_ns)
