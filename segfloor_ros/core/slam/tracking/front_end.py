@@ -39,7 +39,7 @@ from segfloor_ros.core.slam.tracking.map_tracking import (
     Tracker,
 )
 from segfloor_ros.core.slam.tracking.motion import CameraMotion, TrackingState, sigma_m
-from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE, with_patch_noise
+from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ, refine_pose
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
@@ -144,13 +144,13 @@ class FrontEnd:
             track = None
         prior = self.motion.prior(frame.stamp_ns)
         knows_less = track is not None and self.motion.knows_more(track.estimate, frame.stamp_ns)
-        # Images that know less than the sensors, and contradict them, show something else.
-        if track is None or (knows_less and not (track.fits(expected) and track.fits(prior))):
+        # Of images that know less than the sensors: errors of the same points do not average out.
+        if track is None or (knows_less and (prior is not None or not track.fits(expected))):
             self.follower.reset()
             return None
         track = replace(track, sigma_m=sigma_m(track.covariance))
         T_seen = None if knows_less else track.T_camera_world
-        track = self._weighed(replace(track, prior=prior, is_weak=knows_less))
+        track = self._weighed(replace(track, prior=prior))
         self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
         self.follower.see(images, track.point_ids, track.uv_px)
         self.frame_to_frame.see(frame, images, track.estimate)
@@ -300,8 +300,7 @@ class FrontEnd:
         """
         if track is not None and track.observed is not None:
             inside = is_inside(images.excluded, track.observed.features.uv_px)
-            observed = track.observed.take(np.flatnonzero(~inside))
-            return _by_patches(images, observed) if track.is_weak else observed
+            return track.observed.take(np.flatnonzero(~inside))
         features = self.extractor.extract(frame.left, images.excluded)
         if track is None or len(track.point_ids) == 0:
             if not self._map.keyframes:
@@ -316,10 +315,9 @@ class FrontEnd:
             return None
         assert matched.observed is not None
         weighed = self._weighed(replace(matched, prior=track.prior))
-        if not (track.is_weak and track.prior is not None and weighed.prior is None):
-            self.motion.T_camera_world = weighed.T_camera_world
+        self.motion.T_camera_world = weighed.T_camera_world
         self._map.points.note_tracking(matched.visible_ids, matched.point_ids)
-        return _by_patches(images, matched.observed) if track.is_weak else matched.observed
+        return matched.observed
 
     def continue_from(self, images: Images, keyframe: KeyframeRecord) -> None:
         """Track on from the points of a keyframe, old and new."""
@@ -338,13 +336,6 @@ def _with_prior(sparse_map: SparseMap, track: Track, prior: PoseEstimate) -> Pos
     start, camera = by_images.T_camera_world, sparse_map.rig.camera
     found = refine_pose(camera, start, points, seen, prior, is_noise_known=True)
     return replace(by_images, T_camera_world=found.T_camera_world, covariance=found.covariance)
-
-
-def _by_patches(images: Images, observed: ObservedFeatures) -> ObservedFeatures:
-    """Return the features of a frame that shows little, as sure as their patches are."""
-    is_matched = not images.depth_scale
-    observations = with_patch_noise(images.left, observed.observations, is_matched)
-    return replace(observed, observations=observations)
 
 
 def is_near(T_camera_world: Array, expected: PoseEstimate | None) -> bool:

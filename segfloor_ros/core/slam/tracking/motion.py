@@ -146,11 +146,12 @@ class CameraMotion:
         return is_within(motion, (self._max_speed_mps * step_s, MAX_TURN_RADPS * step_s))
 
     def knows_more(self, by_images: PoseEstimate, stamp_ns: int) -> bool:
-        """Whether sensors know some direction of the motion since the last pose better than the
-        images.
+        """Whether sensors know some direction of a pose better than the images: wheels since the
+        last keyframe, others since the last pose.
         """
         measured = None if self.state.is_lost else self.measured(stamp_ns)
-        return measured is not None and knows_more(measured.covariance, by_images)
+        known = self.prior(stamp_ns) or measured
+        return known is not None and knows_more(known.covariance, by_images)
 
     def _expected_lost(self, stamp_ns: int) -> PoseEstimate | None:
         turned = self._turned(stamp_ns)
