@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import time
 
-from std_srvs.srv import SetBool
-
 from segfloor_ros.apps.cli.replay_nodes import NodeGraph
 from segfloor_ros.apps.cli.replay_session import connected_nodes, cpu_s
 from segfloor_ros.core.configuration import Configuration
@@ -29,11 +27,11 @@ def measure_idle(configuration: Configuration, duration_s: float) -> dict[str, d
     with connected_nodes(configuration, 1.0, lossless=False) as graph:
         graph.spin(SETTLE_S)
         shares[PHASES[0]] = _shares(graph, duration_s, spin=True)
-        graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=False))
+        graph.pause(CAMERA, False)
         graph.spin(2 * SETTLE_S)
         shares[PHASES[1]] = _shares(graph, duration_s, spin=True)
         # The grid maps whether anybody listens or not.
-        graph.call(SetBool, f'{GRID}/pause', SetBool.Request(data=True))
+        graph.pause(GRID, True)
         graph.recorder.destroy_node()
         time.sleep(ALL_IDLE_S)
         shares[PHASES[2]] = _shares(graph, duration_s, spin=False)

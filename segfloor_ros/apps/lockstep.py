@@ -9,7 +9,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -110,13 +110,16 @@ class MapOptions:
         check_camera(saved, camera, str(self.load))
         return saved
 
-    def write(self, write: Callable[[Path], object], interrupted: bool) -> str:
-        """Have the map saved; returns where it is, in words, where that is elsewhere: what is
-        interrupted does not replace an older map. Raises MapError where it cannot be written; it is
-        in the folder for temporary files then, if it can be written there.
+    def write(self, write: Callable[[Path], object], interrupted: bool, has_map: bool) -> str:
+        """Have the map saved where it is to be. Returns, in words, that there is none, or where it
+        is if elsewhere: what is interrupted does not replace an older map. Raises MapError where it
+        cannot be written; it is in the folder for temporary files then, if it can be written there.
         """
-        assert self.save is not None
         path = self.save
+        if path is None:
+            return ''
+        if not has_map:
+            return f'{path}: is not written, since there is no map'
         if interrupted and path.exists():
             path = path.with_name(f'{path.name}.interrupted')
         try:
@@ -131,24 +134,34 @@ class MapOptions:
             raise MapError(f'{error}; the map is in {elsewhere / path.name}') from None
         return '' if path == self.save else f'{self.save}: stays as it was; the map is in {path}'
 
-    def why_not_found(self, name: str, frames: int) -> str:
-        """Return why there is no map where one was loaded."""
-        return (
-            f'{name}: in none of {frames} frames was a place of {self.load} recognised; is it a '
-            'map of this building?'
-        )
+    def why_no_map(
+        self, name: str, frames: int, lost: Iterable[str], has_mount: bool, fault: str
+    ) -> str:
+        """Return why a recording gave no map. lost: the states of the frames that were not tracked.
+        fault: what keyframes failed with on their way to the map, if they did.
+        """
+        if frames == 0:
+            return f'{name}: no frame could be read, so there is no map'
+        if self.load is not None:
+            return (
+                f'{name}: in none of {frames} frames was a place of {self.load} recognised; is it '
+                'a map of this building?'
+            )
+        for state, count in Counter(lost).most_common(1):
+            if count > MAJORITY * frames:
+                return f'{name}: {count} of {frames} frames {state}; so there is no map'
+        if not has_mount:
+            return (
+                f'{name}: no level floor was recognised in {frames} frames, so there is no map; '
+                'give stereo_slam.camera_height_m, camera_pitch_rad and camera_roll_rad, or take '
+                '--no-map for the path alone'
+            )
+        if fault:
+            return f'{name}: no keyframe came to the map: {fault}'
+        return f'{name}: none of {frames} frames could be tracked, so there is no map'
 
 
 NO_MAPS = MapOptions()
-
-
-def no_floor(name: str, frames: int) -> str:
-    """Return why there is no map where the mount of the camera stayed unknown."""
-    return (
-        f'{name}: no level floor was recognised in {frames} frames, so there is no map; give '
-        'stereo_slam.camera_height_m, camera_pitch_rad and camera_roll_rad, or take --no-map for '
-        'the path alone'
-    )
 
 
 class LockstepRun:
@@ -259,15 +272,12 @@ class LockstepRun:
 
     def save_map(self) -> None:
         """Save the map, after `execute`. Raises MapError where it cannot be written there."""
-        save = self._map_options.save
-        if save is None:
-            return
-        if self.no_map:
-            self.note = f'{save}: is not written, since there is no map'
-            return
-        inputs = (self._map_options.load, *self._map_options.inputs)
-        write = partial(write_map_file, saved=save_pipeline(self._pipeline), inputs=inputs)
-        self.note = self._map_options.write(write, self._is_cut_short)
+        maps = self._map_options
+
+        def write(path: Path) -> None:
+            write_map_file(path, save_pipeline(self._pipeline), (maps.load, *maps.inputs))
+
+        self.note = maps.write(write, self._is_cut_short, not self.no_map)
 
     def _tracked_poses(self) -> list[TrackedPose]:
         return [
@@ -382,19 +392,10 @@ class LockstepRun:
 
     def _why_no_map(self) -> str:
         name = self._configuration.stereo_camera.input
-        if self._frames == 0:
-            return f'{name}: no frame could be read, so there is no map'
-        if self._map_options.load is not None:
-            return self._map_options.why_not_found(name, self._frames)
-        lost = Counter(result.state for result in self._results if not result.tracked)
-        for state, count in lost.most_common(1):
-            if count > MAJORITY * self._frames:
-                return f'{name}: {count} of {self._frames} frames {state}; so there is no map'
-        if self._known_mount is None:
-            return no_floor(name, self._frames)
-        if self._pipeline.fault:
-            return f'{name}: no keyframe came to the map: {self._pipeline.fault}'
-        return f'{name}: none of {self._frames} frames could be tracked, so there is no map'
+        states = [result.state for result in self._results if not result.tracked]
+        return self._map_options.why_no_map(
+            name, self._frames, states, self._known_mount is not None, self._pipeline.fault
+        )
 
     def _sensors_used(self) -> dict[str, int]:
         """Return the messages used of each sensor besides the stereo images."""

@@ -344,13 +344,14 @@ class LabelledPoints:
 @dataclass(frozen=True)
 class RelativeMotion:
     """The camera's motion between two frames: T_now_before (4, 4), and the covariance (6, 6) of the
-    twist in exp(twist) T_now_before, translation first. source: wheels, an IMU, a gyroscope alone
-    with a speed that is taken for constant, or nothing at all: the last pose is held.
+    twist in exp(twist) T_now_before, translation first. source: wheels, the images of two frames
+    alone, an IMU, a gyroscope alone with a speed that is taken for constant, or nothing at all: the
+    last pose is held.
     """
 
     T_now_before: Array
     covariance: Array
-    source: Literal['wheels', 'IMU', 'gyroscope', 'nothing'] = 'wheels'
+    source: Literal['wheels', 'images', 'IMU', 'gyroscope', 'nothing'] = 'wheels'
 
     @property
     def by_wheels(self) -> bool:

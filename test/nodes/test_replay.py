@@ -151,6 +151,21 @@ def test_eyes_that_are_exchanged_are_said_also_where_no_map_comes_of_it(tmp_path
 
 
 @pytest.mark.slow
+def test_why_there_is_no_map_is_said_as_by_a_run(tmp_path) -> None:
+    blank = np.zeros_like(room_drive(5)[0][0].left)
+    frames = [replace(f, left=blank, right=blank) for f in room_drive(5)[0]]
+    drive = write_kitti(tmp_path / 'blank', frames)
+    values = ('camera_height_m=0.3', 'camera_pitch_rad=0', 'camera_roll_rad=0')
+    mount = [word for value in values for word in ('--set', f'stereo_slam.{value}')]
+    for command, rate in (('run', ()), ('replay', ('--rate', 0))):
+        out = tmp_path / 'out'
+        status, _, errors = segfloor(command, drive, '--out', out, *rate, *mount)
+        assert status == 1
+        words = f'{drive}: 5 of 5 frames lost: left image without contrast'
+        assert words in ' '.join(errors.split()), errors
+
+
+@pytest.mark.slow
 def test_the_replay_saves_loads_and_localizes_as_the_run_does(drive, tmp_path) -> None:
     maps = {kind: tmp_path / f'{kind}.map' for kind in ('run', 'replay')}
     for kind, rate in (('run', ()), ('replay', ('--rate', 0))):

@@ -21,7 +21,7 @@ import typer
 import yaml
 from geometry_msgs.msg import Twist, TwistStamped, Vector3
 from sensor_msgs.msg import Image
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import Trigger
 
 from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.apps.cli.replay_nodes import STALL_S, NodeGraph, ReplayError, running_nodes
@@ -115,7 +115,7 @@ class ExploreSession:
         with running_nodes(self._parameters, self.params_file, None, nodes) as graph:
             pilot = Pilot(graph, self.explorer, self.found, self.on_map)
             graph.connect(is_paced=False, interrupted=self.interrupt)
-            graph.call(SetBool, f'{ROBOT}/pause', SetBool.Request(data=False))
+            graph.pause(ROBOT, False)
             graph.processes.restarts_killed = True
             start_s, pilot.last_sign_s = time.monotonic(), time.monotonic()
             while not (self.explorer.is_done or self.interrupt.is_set()):

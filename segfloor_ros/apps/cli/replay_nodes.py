@@ -23,6 +23,7 @@ import yaml
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import SetBool
 
 from segfloor_ros.apps.cli.replay_recorder import SEMANTIC, SPIN_S, MaskListener, ReplayRecorder
 from segfloor_ros.apps.lockstep import ProgressListener
@@ -129,8 +130,11 @@ class NodeProcesses:
         """Return the resident memory of all processes together in MB."""
         return sum(rss_mb(process.pid) for process in self._processes.values())
 
-    def stop(self) -> None:
-        """Interrupt all processes; terminate, then kill those that stay."""
+    def stop(self) -> float:
+        """Interrupt all processes; terminate, then kill those that stay. Returns the seconds it
+        took.
+        """
+        start_s = time.monotonic()
         for stop_signal in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
             running = [p for p in self._processes.values() if p.poll() is None]
             for process in running:
@@ -139,6 +143,7 @@ class NodeProcesses:
             for process in running:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(max(deadline_s - time.monotonic(), 0.0))
+        return time.monotonic() - start_s
 
     def notices(self) -> list[str]:
         """Return the warnings and errors the nodes have logged, each line once."""
@@ -329,6 +334,10 @@ class NodeGraph:
         response = self.ask(kind, name, request, patience_s)
         if not response.success:
             raise ReplayError(f'{name}: {response.message}')
+
+    def pause(self, node: str, is_paused: bool) -> None:
+        """Pause a node, or have it go on. Raises ReplayError."""
+        self.call(SetBool, f'{node}/pause', SetBool.Request(data=is_paused))
 
     def ask(self, kind: Any, name: str, request: Any, patience_s: float = PATIENCE_S) -> Any:
         """Return the answer of a service. Raises ReplayError where there is none."""

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import Trigger
 
 from segfloor_ros.apps.cli.replay_nodes import (
     STALL_S,
@@ -31,7 +31,7 @@ from segfloor_ros.apps.cli.replay_nodes import (
 from segfloor_ros.apps.cli.replay_recorder import POINTS, MaskListener, ReplayRecorder, ViewNode
 from segfloor_ros.apps.cli.view import View
 from segfloor_ros.apps.label_files import labels_of
-from segfloor_ros.apps.lockstep import NO_MAPS, MapOptions, ProgressListener, no_floor
+from segfloor_ros.apps.lockstep import NO_MAPS, MapOptions, ProgressListener
 from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.results_folder import RunResult, summarise
 from segfloor_ros.apps.trajectory import Trajectory, corrected_trajectory
@@ -167,9 +167,7 @@ class ReplaySession:
             notes = self._save_map(graph, result.summary.interrupted)
         except MapError as error:
             notes, status = str(error), status or 1
-        stop_s = time.perf_counter()
-        graph.processes.stop()
-        shutdown_s = time.perf_counter() - stop_s
+        shutdown_s = graph.processes.stop()
         if broken is not None:
             notices.append(f'{broken}; the {"map" if grid else "path"} is of what came before')
         report = ReplayReport(
@@ -184,9 +182,9 @@ class ReplaySession:
     def _play(self, graph: NodeGraph) -> tuple[SegfloorError | None, bool]:
         """Play the recording; returns what it broke off with, and whether it came to its end."""
         try:
-            graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=False))
+            graph.pause(CAMERA, False)
             if not graph.play(self.on_progress, self.interrupt):
-                graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=True))
+                graph.pause(CAMERA, True)
                 graph.catch_up()
                 return None, False
         except ReplayError as error:
@@ -200,11 +198,6 @@ class ReplaySession:
         """Save the map; returns where it is where that is elsewhere, or why it is not saved, else
         ''. Raises MapError.
         """
-        save = self.maps.save
-        if save is None:
-            return ''
-        if self.path_only:
-            return f'{save}: is not written, since there is no map'
 
         def write(path: Path) -> None:
             name = Parameter('save_map', value=str(path.absolute())).to_parameter_msg()
@@ -212,20 +205,19 @@ class ReplaySession:
             graph.ask(SetParameters, f'{SLAM}/set_parameters', request)
             graph.call(Trigger, f'{SLAM}/save_map', Trigger.Request(), STALL_S)
 
-        return self.maps.write(write, interrupted)
+        return self.maps.write(write, interrupted, not self.path_only)
 
     def _check_result(self, recorder: ReplayRecorder, broken: SegfloorError | None) -> None:
-        name, notes = self.configuration.stereo_camera.input, recorder.notes
-        sent = len(notes.frame_index)
-        if self.loaded is not None:
-            if not recorder.tracked:
-                raise broken or MapError(self.maps.why_not_found(name, sent))
+        notes = recorder.notes
+        found = notes.flagged('tracked') if self.path_only else notes.updated
+        if recorder.tracked if self.loaded is not None else recorder.mount and found:
             return
-        if recorder.mount is None:
-            raise broken or MapError(no_floor(name, sent))
-        if not (notes.flagged('tracked') if self.path_only else notes.updated):
-            words = next((s.message for s in notes.failed.values()), 'none could be tracked')
-            raise broken or MapError(f'{name}: no map came of {sent} frames: {words}')
+        has_mount = self.configuration.stereo_slam.has_mount or recorder.mount is not None
+        name, frames = self.configuration.stereo_camera.input, len(notes.frame_index)
+        answers, failed = notes.answers.values(), notes.failed.values()
+        lost = [status.message for status in answers if status.values.get('tracked') == '0']
+        fault = next((status.message for status in failed), '')
+        raise broken or MapError(self.maps.why_no_map(name, frames, lost, has_mount, fault))
 
     def _result(
         self, recorder: ReplayRecorder, grid: OccupancyGrid | None, wall_s: float, is_whole: bool
@@ -344,7 +336,7 @@ def _follow(graph: NodeGraph, on_progress: ProgressListener) -> NodeFigures:
         on_progress(done, words)
 
     start_s, before_s = time.monotonic(), cpu_s(graph.processes)
-    graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=False))
+    graph.pause(CAMERA, False)
     try:
         graph.play(follow, threading.Event())
     except ReplayError:
@@ -353,9 +345,7 @@ def _follow(graph: NodeGraph, on_progress: ProgressListener) -> NodeFigures:
     wall_s = time.monotonic() - start_s
     spent_s = {node: s - before_s[node] for node, s in cpu_s(graph.processes).items()}
     graph.spin(2 * HEALTH_PERIOD_S)
-    stop_s = time.monotonic()
-    graph.processes.stop()
-    shutdown_s = time.monotonic() - stop_s
+    shutdown_s = graph.processes.stop()
     arrived_s, sent_s = recorder.arrived_s, notes.done_s[CAMERA]
     mapped = sorted(set(arrived_s['map']).intersection(*notes.done_s.values()))
     done_s = np.array([[notes.done_s[node][stamp] for stamp in mapped] for node in NODES])

@@ -23,8 +23,8 @@ from rclpy.signals import SignalHandlerOptions
 
 from segfloor_ros.apps.recordings.bag_file import CAMERA_INFO, COMPRESSED, IMAGE
 from segfloor_ros.apps.recordings.bag_writer import IMU, ODOMETRY, TF, NewBag
-from segfloor_ros.apps.recordings.ros_bag import message_class
 from segfloor_ros.core.processes import Interrupt
+from segfloor_ros.nodes.messages.making import message_class
 from segfloor_ros.nodes.messages.topics import PATIENCE_S, prepare_middleware
 
 RECORDED = (IMAGE, COMPRESSED, CAMERA_INFO, IMU, ODOMETRY, TF)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from enum import Enum
 from pathlib import Path
@@ -18,22 +18,24 @@ from numpy.typing import NDArray
 from segfloor_ros.apps.recordings.bag_file import CAMERA_INFO, COMPRESSED, IMAGE, MISSING_LIBRARY
 from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.core.camera.measurements import NOT_MEASURED
 from segfloor_ros.core.camera.model import is_disparity
 from segfloor_ros.core.camera.recording import IMU_FRAME, MeasurementLog, RawPair
 from segfloor_ros.core.contracts import ImuSample, Measurement, WheelPose
 from segfloor_ros.core.errors import InputError, os_errors
-from segfloor_ros.core.files.images import jpeg_bytes, png_bytes
+from segfloor_ros.core.files.images import JPEG_QUALITY
 from segfloor_ros.core.files.writing import scratch_folder
-from segfloor_ros.core.geometry import Array, make_transform
-from segfloor_ros.core.quaternions import quaternion_xyzw
+from segfloor_ros.core.geometry import make_transform
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, compressed_message
+from segfloor_ros.nodes.messages.images import image_message
+from segfloor_ros.nodes.messages.making import Make
+from segfloor_ros.nodes.messages.poses import transform_message
+from segfloor_ros.nodes.messages.sensors import imu_message, wheel_message
 
 SIDES = ('left', 'right')
 FRAME_IDS = ('left_camera_optical_frame', 'right_camera_optical_frame')
 TF_TOPIC = '/tf_static'
 
 WHEELS_TOPIC, IMU_TOPIC, DEPTH_TOPIC = '/wheel_odometry', '/imu', '/depth/image_raw'
-WHEELS_FRAME = 'wheel_odom'
 
 RESERVE_S, LEAST_FREE_BYTES = 10.0, 64_000_000
 """A recording ends while there is space for what comes in this time, so that its file is whole."""
@@ -101,15 +103,12 @@ def _by_stamp(source: StereoSource | None) -> Callable[[int], RawPair | None]:
 
 
 class BagLibrary(Protocol):
-    """A library that writes a rosbag2 folder of one mcap file. types: message classes by name."""
+    """A library that writes a rosbag2 folder of one mcap file. make: makes its messages."""
 
-    types: Mapping[str, Any]
+    make: Make
 
     def knows(self, kind: str) -> bool:
         """Whether messages of a type can be written."""
-
-    def sequence(self, values: NDArray[Any]) -> Any:
-        """Return an array (N,) as the message classes take it for a sequence."""
 
     def serialize(self, message: Any, kind: str) -> bytes | memoryview:
         """Return a message of a type in CDR."""
@@ -141,7 +140,6 @@ class Rosbags:
         from rosbags.typesys import Stores, get_typestore
 
         self._store = get_typestore(Stores.ROS2_JAZZY)
-        self.types: Mapping[str, Any] = self._store.types
         self._connections: dict[str, Any] = {}
         self._writer = rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
         if compressed:
@@ -152,11 +150,11 @@ class Rosbags:
 
     def knows(self, kind: str) -> bool:
         """Whether it is a type of ROS 2 Jazzy."""
-        return kind in self.types
+        return kind in self._store.types
 
-    def sequence(self, values: NDArray[Any]) -> Any:
-        """Return the array itself."""
-        return values
+    def make(self, kind: str, **fields: Any) -> Any:
+        """Return a message of a type."""
+        return self._store.types[kind](**fields)
 
     def serialize(self, message: Any, kind: str) -> bytes | memoryview:
         """Return a message of a type in CDR."""
@@ -268,7 +266,7 @@ class BagWriter:
 
     def __enter__(self) -> BagWriter:
         self.file.__enter__()
-        self.messages = BagMessages(self.file.library.types)
+        self._make = self.file.library.make
         return self
 
     def __exit__(self, *error: Any) -> None:
@@ -286,28 +284,35 @@ class BagWriter:
     def _write_image(
         self, side: str, stamp_ns: int, frame_id: str, eye: EyeCalibration, image: NDArray[np.uint8]
     ) -> None:
-        info = self._info_message(self.messages.header(stamp_ns, frame_id), eye)
-        self.write_message(f'/{side}/camera_info', CAMERA_INFO, stamp_ns, info)
-        kind = IMAGE if self._coding is ImageCoding.raw else COMPRESSED
-        picture = self._picture_message(stamp_ns, frame_id, image)
-        self.write_message(self._image_topic(side), kind, stamp_ns, picture)
+        info = camera_info_message(stamp_ns, frame_id, eye, self._make)
+        self._write(f'/{side}/camera_info', CAMERA_INFO, stamp_ns, info)
+        topic = f'/{side}/image_rect' if self._calibration.is_rectified else f'/{side}/image_raw'
+        if self._coding is ImageCoding.raw:
+            message = image_message(stamp_ns, frame_id, image, make=self._make)
+            self._write(topic, IMAGE, stamp_ns, message)
+        else:
+            quality = JPEG_QUALITY if self._coding is ImageCoding.jpeg else None
+            message = compressed_message(stamp_ns, frame_id, image, quality, self._make)
+            self._write(f'{topic}/compressed', COMPRESSED, stamp_ns, message)
 
     def write_depth(self, pair: RawPair, disparity_times_depth: float) -> None:
         """Append the depths of a pair whose right image is a disparity (H, W)."""
         with np.errstate(divide='ignore'):
             depth_m = np.float32(disparity_times_depth) / pair.right
-        message = self.image_message(pair.stamp_ns, depth_m.astype(np.float32), '32FC1')
-        self.write_message(DEPTH_TOPIC, IMAGE, pair.stamp_ns, message)
+        image = depth_m.astype(np.float32)
+        message = image_message(pair.stamp_ns, FRAME_IDS[0], image, make=self._make)
+        self._write(DEPTH_TOPIC, IMAGE, pair.stamp_ns, message)
 
     def write_measurement(self, measurement: Measurement) -> None:
         """Append what wheels or an IMU measured, the latter in the raw left optical frame."""
         stamp_ns = measurement.stamp_ns
         if isinstance(measurement, WheelPose):
-            odometry = self.messages.odometry(stamp_ns, WHEELS_FRAME, measurement.T_wheels_base)
-            self.write_message(WHEELS_TOPIC, ODOMETRY, stamp_ns, odometry)
+            odometry = wheel_message(measurement, 'base_link', np.zeros(6), self._make)
+            self._write(WHEELS_TOPIC, ODOMETRY, stamp_ns, odometry)
         elif isinstance(measurement, ImuSample):
-            imu = self.messages.imu(measurement, self._imu_frame(measurement), self._turn_imu)
-            self.write_message(IMU_TOPIC, IMU, stamp_ns, imu)
+            frame_id = self._imu_frame(measurement)
+            imu = imu_message(measurement, frame_id, self._turn_imu, self._make)
+            self._write(IMU_TOPIC, IMU, stamp_ns, imu)
 
     def _imu_frame(self, sample: ImuSample) -> str:
         """Return the frame of an IMU, which is written before its first sample."""
@@ -315,118 +320,10 @@ class BagWriter:
             return FRAME_IDS[0]
         if not self.file.has(TF_TOPIC):
             T_raw_imu = make_transform(np.eye(3), self._turn_imu @ sample.place_m)
-            transform = self.messages.transform(FRAME_IDS[0], IMU_FRAME, T_raw_imu)
-            self.write_message(TF_TOPIC, TF, sample.stamp_ns, transform)
+            link = transform_message(0, FRAME_IDS[0], IMU_FRAME, T_raw_imu, self._make)
+            transforms = self._make(TF, transforms=[link])
+            self._write(TF_TOPIC, TF, sample.stamp_ns, transforms)
         return IMU_FRAME
 
-    def write_message(self, topic: str, kind: str, stamp_ns: int, message: Any) -> None:
-        """Append a message of a type to a topic, recorded at stamp_ns."""
+    def _write(self, topic: str, kind: str, stamp_ns: int, message: Any) -> None:
         self.file.write(topic, kind, stamp_ns, self.file.library.serialize(message, kind))
-
-    def _image_topic(self, side: str) -> str:
-        image = 'image_rect' if self._calibration.is_rectified else 'image_raw'
-        suffix = '' if self._coding is ImageCoding.raw else '/compressed'
-        return f'/{side}/{image}{suffix}'
-
-    def image_message(
-        self, stamp_ns: int, image: NDArray[Any], encoding: str, frame_id: str = FRAME_IDS[0]
-    ) -> Any:
-        """Return a sensor_msgs/Image of an image (H, W) of one channel."""
-        pixels = np.ascontiguousarray(image)
-        height, width = pixels.shape
-        return self.messages.types[IMAGE](
-            header=self.messages.header(stamp_ns, frame_id),
-            height=height,
-            width=width,
-            encoding=encoding,
-            is_bigendian=0,
-            step=width * pixels.itemsize,
-            data=self.file.library.sequence(pixels.ravel().view(np.uint8)),
-        )
-
-    def _picture_message(self, stamp_ns: int, frame_id: str, image: NDArray[np.uint8]) -> Any:
-        if self._coding is ImageCoding.raw:
-            return self.image_message(stamp_ns, image, 'mono8', frame_id)
-        encoded = (png_bytes if self._coding is ImageCoding.png else jpeg_bytes)(image)
-        words = f'mono8; {self._coding.value} compressed mono8'
-        header = self.messages.header(stamp_ns, frame_id)
-        data = self.file.library.sequence(np.frombuffer(encoded, np.uint8))
-        return self.messages.types[COMPRESSED](header=header, format=words, data=data)
-
-    def _info_message(self, header: Any, eye: EyeCalibration) -> Any:
-        whole_image = self.messages.types['sensor_msgs/msg/RegionOfInterest'](
-            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        )
-        return self.messages.types[CAMERA_INFO](
-            header=header,
-            height=eye.height,
-            width=eye.width,
-            distortion_model=eye.distortion_model,
-            d=self.file.library.sequence(eye.D),
-            k=eye.K.ravel(),
-            r=eye.R.ravel(),
-            p=eye.P.ravel(),
-            binning_x=0,
-            binning_y=0,
-            roi=whole_image,
-        )
-
-
-class BagMessages:
-    """Makes messages of the classes of a typestore, by name."""
-
-    def __init__(self, types: Mapping[str, Any]) -> None:
-        self.types = types
-
-    def header(self, stamp_ns: int, frame_id: str) -> Any:
-        """Return a std_msgs/Header."""
-        sec, nanosec = divmod(int(stamp_ns), 1_000_000_000)
-        stamp = self.types['builtin_interfaces/msg/Time'](sec=sec, nanosec=nanosec)
-        return self.types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id)
-
-    def odometry(self, stamp_ns: int, frame_id: str, T_frame_base: Array) -> Any:
-        """Return the pose (4, 4) of `base_link` as nav_msgs/Odometry."""
-        types, no_covariance = self.types, np.zeros(36)
-        pose = types['geometry_msgs/msg/Pose'](
-            position=self._filled('Point', T_frame_base[:3, 3]),
-            orientation=self._filled('Quaternion', quaternion_xyzw(T_frame_base[:3, :3])),
-        )
-        still = self._filled('Vector3', np.zeros(3))
-        twist = types['geometry_msgs/msg/Twist'](linear=still, angular=still)
-        return types[ODOMETRY](
-            header=self.header(stamp_ns, frame_id),
-            child_frame_id='base_link',
-            pose=types['geometry_msgs/msg/PoseWithCovariance'](pose=pose, covariance=no_covariance),
-            twist=types['geometry_msgs/msg/TwistWithCovariance'](
-                twist=twist, covariance=no_covariance
-            ),
-        )
-
-    def imu(self, sample: ImuSample, frame_id: str, R_frame_left: Array) -> Any:
-        """Return a sample as sensor_msgs/Imu in a frame that R_frame_left (3, 3) turns it into."""
-        no_covariance = np.zeros(9)
-        return self.types[IMU](
-            header=self.header(sample.stamp_ns, frame_id),
-            orientation=self._filled('Quaternion', np.array([0.0, 0.0, 0.0, 1.0])),
-            orientation_covariance=np.array([NOT_MEASURED, *[0.0] * 8]),
-            angular_velocity=self._filled('Vector3', R_frame_left @ sample.gyro_rad_s),
-            angular_velocity_covariance=no_covariance,
-            linear_acceleration=self._filled('Vector3', R_frame_left @ sample.accel_m_s2),
-            linear_acceleration_covariance=no_covariance,
-        )
-
-    def transform(self, frame_id: str, child: str, T_frame_child: Array) -> Any:
-        """Return a fixed transform (4, 4) as tf2_msgs/TFMessage."""
-        transform = self.types['geometry_msgs/msg/Transform'](
-            translation=self._filled('Vector3', T_frame_child[:3, 3]),
-            rotation=self._filled('Quaternion', quaternion_xyzw(T_frame_child[:3, :3])),
-        )
-        stamped = self.types['geometry_msgs/msg/TransformStamped'](
-            header=self.header(0, frame_id), child_frame_id=child, transform=transform
-        )
-        return self.types[TF](transforms=[stamped])
-
-    def _filled(self, kind: str, xyzw: Array) -> Any:
-        """Return a type of geometry_msgs with fields x, y, z and, of four values, w."""
-        fields = {name: float(value) for name, value in zip('xyzw', xyzw, strict=False)}
-        return self.types[f'geometry_msgs/msg/{kind}'](**fields)

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
 from segfloor_ros.apps.recordings.bag_file import ReadMessages, Topic, read_rosbag2_with
 from segfloor_ros.apps.recordings.bag_writer import write_rosbag2_with
+from segfloor_ros.nodes.messages.making import message_class, ros_message
 
 STORAGE = {'.mcap': 'mcap', '.db3': 'sqlite3'}
 
@@ -61,7 +59,7 @@ class Rosbag2Writer:
     def __init__(self, folder: Path, compressed: bool) -> None:
         from rosbag2_py import ConverterOptions, SequentialWriter, StorageOptions
 
-        self.types: Mapping[str, Any] = MessageClasses()
+        self.make = ros_message
         self._topics: set[str] = set()
         self._writer = SequentialWriter()
         profile = 'zstd_fast' if compressed else ''
@@ -71,10 +69,6 @@ class Rosbag2Writer:
     def knows(self, kind: str) -> bool:
         """Whether this machine has a message type."""
         return importlib.util.find_spec(kind.partition('/')[0]) is not None
-
-    def sequence(self, values: NDArray[Any]) -> array[Any]:
-        """Return an array (N,) as messages take it without a look at every element."""
-        return array(values.dtype.char, values.tobytes())
 
     def serialize(self, message: Any, kind: str) -> bytes:
         """Return a message in CDR."""
@@ -98,17 +92,3 @@ class Rosbag2Writer:
     def close(self, is_whole: bool) -> None:
         """Complete the file: the writer does that when it goes."""
         del self._writer
-
-
-class MessageClasses(dict[str, Any]):
-    """Classes of message types by name, imported when they are asked for."""
-
-    def __missing__(self, name: str) -> Any:
-        self[name] = message_class(name)
-        return self[name]
-
-
-def message_class(name: str) -> Any:
-    """Return the class of a message type, e.g. `sensor_msgs/msg/Image`."""
-    package, _, kind = name.split('/')
-    return getattr(importlib.import_module(f'{package}.msg'), kind)

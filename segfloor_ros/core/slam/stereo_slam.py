@@ -285,7 +285,9 @@ class StereoSlam:
             observed.features.octave,
             observed.observations,
             self.map.living(observed.point_id),
-            motion.since_keyframe.start(motion.T_camera_world, motion.covariance),
+            motion.since_keyframe.start(
+                motion.T_camera_world, observed.known_share * motion.covariance
+            ),
             self.sensors.up_camera(self.front_end.motion.T_odom_camera),
             ground=self._ground.take(frame.left),
         )

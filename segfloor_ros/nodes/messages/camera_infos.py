@@ -2,35 +2,38 @@
 
 from __future__ import annotations
 
-import array
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.nodes.messages.topics import make_header
+from segfloor_ros.nodes.messages.making import Make, Message, make_header, ros_message
+
+WHOLE_IMAGE = {'x_offset': 0, 'y_offset': 0, 'height': 0, 'width': 0, 'do_rectify': False}
 
 
-def camera_info_message(stamp_ns: int, frame_id: str, eye: EyeCalibration) -> CameraInfo:
+def camera_info_message(
+    stamp_ns: int, frame_id: str, eye: EyeCalibration, make: Make = ros_message
+) -> Message:
     """Return the calibration of one eye; both eyes carry the left optical frame (REP-104: the
     right one's offset stands in P[3]).
     """
-    return CameraInfo(
-        header=make_header(stamp_ns, frame_id),
+    arrays = {name: np.asarray(getattr(eye, name.upper()), np.float64).ravel() for name in 'dkrp'}
+    return make(
+        'sensor_msgs/msg/CameraInfo',
+        header=make_header(stamp_ns, frame_id, make),
         width=int(eye.width),
         height=int(eye.height),
         distortion_model=eye.distortion_model,
-        d=array.array('d', np.asarray(eye.D, np.float64).tobytes()),
-        k=np.asarray(eye.K, np.float64).ravel(),
-        r=np.asarray(eye.R, np.float64).ravel(),
-        p=np.asarray(eye.P, np.float64).ravel(),
+        **arrays,
+        binning_x=0,
+        binning_y=0,
+        roi=make('sensor_msgs/msg/RegionOfInterest', **WHOLE_IMAGE),
     )
 
 
-def same_calibration(a: CameraInfo, b: CameraInfo) -> bool:
+def same_calibration(a: Message, b: Message) -> bool:
     """Return whether two messages hold the same calibration."""
     sizes = ((a.width, a.height), (b.width, b.height))
     return (
@@ -51,8 +54,12 @@ def rectified_calibration(camera: StereoCamera) -> StereoCalibration:
 
 
 def compressed_message(
-    stamp_ns: int, frame_id: str, image: NDArray[np.generic], jpeg_quality: int | None
-) -> CompressedImage:
+    stamp_ns: int,
+    frame_id: str,
+    image: NDArray[np.generic],
+    jpeg_quality: int | None,
+    make: Make = ros_message,
+) -> Message:
     """Return a grey image (H, W) as a message as image_transport makes it: JPEG of a quality of
     1 to 100, or PNG, without loss, where that is None or the image has 16 bits.
     """
@@ -60,8 +67,9 @@ def compressed_message(
     options = [] if kind == 'png' else [cv2.IMWRITE_JPEG_QUALITY, int(jpeg_quality or 0)]
     _, data = cv2.imencode(f'.{kind}', np.ascontiguousarray(image), options)
     encoding = 'mono16' if image.dtype == np.uint16 else 'mono8'
-    return CompressedImage(
-        header=make_header(stamp_ns, frame_id),
+    return make(
+        'sensor_msgs/msg/CompressedImage',
+        header=make_header(stamp_ns, frame_id, make),
         format=f'{encoding}; {kind} compressed {encoding}',
-        data=array.array('B', data.tobytes()),
+        data=data.ravel(),
     )

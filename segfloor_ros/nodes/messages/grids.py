@@ -8,7 +8,7 @@ import numpy as np
 from nav_msgs.msg import OccupancyGrid as OccupancyGridMessage
 
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.nodes.messages.topics import make_header, to_time
+from segfloor_ros.nodes.messages.making import make_header, to_time
 
 
 def grid_message(stamp_ns: int, frame_id: str, grid: OccupancyGrid) -> OccupancyGridMessage:

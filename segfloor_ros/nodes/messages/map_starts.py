@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sensor_msgs.msg import TimeReference
 
-from segfloor_ros.nodes.messages.topics import make_header, to_ns, to_time
+from segfloor_ros.nodes.messages.making import make_header, to_ns, to_time
 
 
 def map_start_message(

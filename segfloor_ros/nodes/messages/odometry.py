@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, Vector3
-from nav_msgs.msg import Odometry
 
 from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.twists import se3_log
-from segfloor_ros.nodes.messages.poses import LEAST_VARIANCE, pose_message
-from segfloor_ros.nodes.messages.topics import make_header
+from segfloor_ros.nodes.messages.making import Make, Message, make_header, ros_message
+from segfloor_ros.nodes.messages.poses import filled, pose_message
+
+LEAST_VARIANCE = 1e-6
+"""Of a millimetre and a milliradian, in m² and rad²: filters take a zero for certainty."""
 
 
 def odometry_message(
@@ -20,36 +21,41 @@ def odometry_message(
     covariance: Array,
     twist: Array | None = None,
     twist_covariance: Array | None = None,
-) -> Odometry:
+    make: Make = ros_message,
+) -> Message:
     """Return the odometry of frame b in frame a.
 
     covariance: (6, 6), order x y z roll pitch yaw. twist: (6,) linear and angular velocity in
     frame b, m/s and rad/s, with its covariance (6, 6); None is marked as unknown by a large
     variance.
     """
-    message = Odometry(header=make_header(stamp_ns, frame_id), child_frame_id=child_frame_id)
-    message.pose.pose = pose_message(T_a_b)
-    message.pose.covariance = np.ascontiguousarray(covariance, np.float64).ravel()
     if twist is None:
-        message.twist.covariance = (np.eye(6) / LEAST_VARIANCE).ravel()
-    else:
-        vx, vy, vz, wx, wy, wz = (float(value) for value in twist)
-        message.twist.twist = Twist(
-            linear=Vector3(x=vx, y=vy, z=vz), angular=Vector3(x=wx, y=wy, z=wz)
-        )
-        if twist_covariance is not None:
-            message.twist.covariance = np.ascontiguousarray(twist_covariance, np.float64).ravel()
-    return message
+        twist, twist_covariance = np.zeros(6), np.eye(6) / LEAST_VARIANCE
+    linear, angular = filled('Vector3', twist[:3], make), filled('Vector3', twist[3:], make)
+    velocity = make('geometry_msgs/msg/Twist', linear=linear, angular=angular)
+    uncertainty = np.zeros(36) if twist_covariance is None else twist_covariance
+    return make(
+        'nav_msgs/msg/Odometry',
+        header=make_header(stamp_ns, frame_id, make),
+        child_frame_id=child_frame_id,
+        pose=_uncertain('Pose', pose_message(T_a_b, make), covariance, make),
+        twist=_uncertain('Twist', velocity, uncertainty, make),
+    )
 
 
 def pose_with_covariance_message(
     stamp_ns: int, frame_id: str, T_a_b: Array, covariance: Array
-) -> PoseWithCovarianceStamped:
+) -> Message:
     """Return the pose of frame b in frame a. covariance: (6, 6), order x y z roll pitch yaw."""
-    message = PoseWithCovarianceStamped(header=make_header(stamp_ns, frame_id))
-    message.pose.pose = pose_message(T_a_b)
-    message.pose.covariance = np.ascontiguousarray(covariance, np.float64).ravel()
-    return message
+    header, pose = make_header(stamp_ns, frame_id), pose_message(T_a_b)
+    uncertain = _uncertain('Pose', pose, covariance, ros_message)
+    return ros_message('geometry_msgs/msg/PoseWithCovarianceStamped', header=header, pose=uncertain)
+
+
+def _uncertain(kind: str, value: Message, covariance: Array, make: Make) -> Message:
+    numbers = np.ascontiguousarray(covariance, np.float64).ravel()
+    whole = {kind.lower(): value, 'covariance': numbers}
+    return make(f'geometry_msgs/msg/{kind}WithCovariance', **whole)
 
 
 def body_twist(T_a_before: Array, T_a_now: Array, duration_s: float) -> Array:

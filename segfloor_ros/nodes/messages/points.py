@@ -10,7 +10,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 
 from segfloor_ros.core.contracts import KeyframeFeatures, LabelledPoints, MovingPoints, SparseCloud
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.nodes.messages.topics import make_header
+from segfloor_ros.nodes.messages.making import make_header
 
 _XYZ = [('x', '<f4'), ('y', '<f4'), ('z', '<f4')]
 

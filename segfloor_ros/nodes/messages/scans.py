@@ -12,7 +12,7 @@ from sensor_msgs.msg import LaserScan
 
 from segfloor_ros.core.contracts import CELL_M, RANGE_MAX_ERROR_M, FloorScan
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.nodes.messages.topics import make_header
+from segfloor_ros.nodes.messages.making import make_header
 
 
 def free_ranges(scan: FloorScan) -> NDArray[np.float32]:

@@ -16,7 +16,6 @@ from importlib import resources
 from pathlib import Path as FilePath
 from typing import Any
 
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import (
     PointStamped,
@@ -25,7 +24,6 @@ from geometry_msgs.msg import (
     TwistStamped,
 )
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
-from rclpy.constants import S_TO_NS
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import (
     CameraInfo,
@@ -38,6 +36,8 @@ from sensor_msgs.msg import (
 )
 from std_msgs.msg import Header, String, UInt8MultiArray
 from stereo_msgs.msg import DisparityImage
+
+from segfloor_ros.nodes.messages.making import make_header, to_ns, to_time  # noqa: F401
 
 PROFILES = FilePath(str(resources.files('segfloor_ros.nodes') / 'fastdds.xml'))
 """Shared memory for stereo images and prompt repetition of what was lost, for Fast DDS, the
@@ -271,22 +271,6 @@ def subscribed_by(node: str, alternatives: bool = False) -> list[Topic]:
     if not alternatives:
         return [topic for topic in mine if not topic.instead_of]
     return [t for t in TOPICS.values() if t in mine or node in t.on_demand_by]
-
-
-def to_time(stamp_ns: int) -> Time:
-    """Return the ROS time of a stamp in ns."""
-    sec, nanosec = divmod(int(stamp_ns), S_TO_NS)
-    return Time(sec=sec, nanosec=nanosec)
-
-
-def to_ns(time: Time) -> int:
-    """Return a ROS time in ns."""
-    return int(time.sec) * S_TO_NS + int(time.nanosec)
-
-
-def make_header(stamp_ns: int, frame_id: str) -> Header:
-    """Return a header with a stamp in ns and a frame."""
-    return Header(stamp=to_time(stamp_ns), frame_id=frame_id)
 
 
 def stamp_of(message: Any) -> int:

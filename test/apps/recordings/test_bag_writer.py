@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +61,31 @@ def test_round_trips_are_exact(
     assert out.is_file() == (name == 'drive.mcap')
     assert_same_recording(source, opened(out))
     assert list(out.parent.iterdir()) == [out]
+
+
+WITHOUT_ROS = """
+import sys
+from pathlib import Path
+for name in ('rclpy', 'builtin_interfaces', 'std_msgs', 'geometry_msgs', 'nav_msgs', 'sensor_msgs',
+             'stereo_msgs'):
+    sys.modules[name] = None
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.apps.recordings.bag_writer import convert
+from segfloor_ros.core.camera.settings import StereoCameraSettings
+convert(open_source(StereoCameraSettings(input=sys.argv[1])), Path(sys.argv[2]))
+"""
+
+
+def test_a_bag_is_written_without_ros(tmp_path: Path) -> None:
+    folder = write_kitti(tmp_path / 'drive', grey_pairs(2))
+    (folder / 'wheel_odometry.txt').write_text(WHEELS)
+    (folder / 'imu.csv').write_text(IMU)
+    out = tmp_path / 'drive.mcap'
+    command = [sys.executable, '-c', WITHOUT_ROS, str(folder), str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert_same_recording(opened(folder), opened(out))
+    assert len(measured(opened(out))) == len(measured(opened(folder))) > 0
 
 
 def test_jpeg_is_close(tmp_path: Path) -> None:

@@ -96,6 +96,8 @@ class BackEnd:
             return False
         if track is None:
             return not self._map.keyframes or front_end.is_new_place()
+        if len(track.point_ids) == 0:
+            return True
         since_ns = stamp_ns - front_end.keyframe_ns
         return front_end.local.wants_keyframe(track, frames_since, since_ns, self.idle)
 

@@ -12,12 +12,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.core.camera.pixels import SUBPIXEL
 from segfloor_ros.core.contracts import NO_POINT, StereoFrame, Up
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.mapping.bundle_adjustment import (
@@ -26,19 +24,17 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     adjust,
     gather,
 )
-from segfloor_ros.core.slam.mapping.normal_equations import factors_of
-from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, MAX_DISPARITY_SHARE, NEIGHBOURS, SAME_PX
+from segfloor_ros.core.slam.mapping.normal_equations import factors_of, motion_before
+from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, SAME_PX
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, ENOUGH, MAJORITY, NEARLY_ALL, PROOF
-from segfloor_ros.core.slam.tracking.images import (
-    MAX_HAMMING,
-    SMALL_WIDTH_PX,
-    Images,
-    hamming,
-    one_to_one,
-)
+from segfloor_ros.core.slam.tracking.images import MAX_HAMMING, Images, hamming, one_to_one
 from segfloor_ros.core.slam.tracking.map_tracking import predict_points
-from segfloor_ros.core.slam.tracking.patch_alignment import ALIGNED_PX, SIDE_PX, measure_disparity
+from segfloor_ros.core.slam.tracking.patch_alignment import (
+    ALIGNED_PX,
+    guess_disparity,
+    measure_disparity,
+)
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures
 from segfloor_ros.core.timing import timed
 
@@ -49,7 +45,6 @@ SETTLING_KEYFRAMES, MIN_FOUND_RATIO = 2, 0.25
 """Within so many keyframes others must see a new point too, and in this share of the frames that
 should show it a point must be found (Mur-Artal et al., ORB-SLAM, 2015, section VI-B)."""
 
-MIN_TEXTURE = 5
 MAX_OCTAVES_APART, CANDIDATES = 2.5, 4
 """Levels of the pyramid between two views of what may be one point, and points tried for each."""
 
@@ -210,7 +205,8 @@ class LocalMapper:
         around, _ = self._map.covisible(self._map.points_of(free))
         if keyframe.motion is not None:
             # What wheels tie to the oldest that moves holds it.
-            around = np.append(around, max(int(free.min()) - 1, 0))
+            before, _ = motion_before(self._map.keyframes, int(free.min()))
+            around = np.append(max(before, 0), around)
         fixed = around[~np.isin(around, free)][: NEIGHBOURS - LOCAL_KEYFRAMES]
         if len(fixed) == 0:
             fixed, free = free[-1:], free[:-1]
@@ -230,30 +226,12 @@ class LocalMapper:
 def _linked(sparse_map: SparseMap, keyframe: KeyframeRecord) -> NDArray[np.intp]:
     """Return the keyframes before one that wheels tie to it without a gap, the oldest first."""
     linked: list[int] = []
-    while keyframe.motion is not None and len(linked) < LOCAL_KEYFRAMES - 1:
-        keyframe = sparse_map.keyframes[keyframe.index - 1]
-        if keyframe.retired is None:
-            linked.append(keyframe.index)
+    while len(linked) < LOCAL_KEYFRAMES - 1:
+        before, motion = motion_before(sparse_map.keyframes, (linked or [keyframe.index])[-1])
+        if motion is None:
+            break
+        linked.append(before)
     return np.array(linked[::-1], np.intp)
-
-
-def guess_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], uv_px: Array) -> Array:
-    """Return about the disparity (N,) px at pixels (N, 2) of the left image; NaN where none is
-    found. left, right: rectified grey images (H, W).
-    """
-    factor = max(1, round(left.shape[1] / SMALL_WIDTH_PX))
-    size = (left.shape[1] // factor, left.shape[0] // factor)
-    count = -(-round(MAX_DISPARITY_SHARE * size[0]) // SUBPIXEL) * SUBPIXEL
-    matcher = cv2.StereoBM_create(count, SIDE_PX)
-    matcher.setTextureThreshold(MIN_TEXTURE)
-    matcher.setUniquenessRatio(0)
-    # Without a margin the matcher leaves the leftmost columns empty.
-    small = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, right))
-    wide = (cv2.copyMakeBorder(i, 0, 0, count, 0, cv2.BORDER_REPLICATE) for i in small)
-    disparity = matcher.compute(*wide)[:, count:]
-    column, row = ((uv_px.T + 0.5) / factor).astype(np.intp)
-    at = disparity[np.clip(row, 0, size[1] - 1), np.clip(column, 0, size[0] - 1)]
-    return np.where(at > 0, at * (factor / SUBPIXEL), np.nan)
 
 
 def fuse_duplicates(sparse_map: SparseMap, keyframe: KeyframeRecord) -> int:

@@ -43,6 +43,7 @@ from segfloor_ros.core.slam.rig import (
     with_moment,
 )
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, LoopEdge
+from segfloor_ros.core.slam.tracking.motion import joined_motion
 from segfloor_ros.core.twists import adjoint, se3_logs
 
 MANY, LEFT = 300, 0.01
@@ -435,6 +436,20 @@ class Levels:
         return np.asarray(T_camera_world[self.keyframes[:, 0], :3, :3] @ self.up_world)
 
 
+def motion_before(
+    keyframes: Sequence[KeyframeRecord], index: int
+) -> tuple[int, RelativeMotion | None]:
+    """Return the keyframe before one, by index, that is not retired, and the motion from there;
+    None where it was not measured all the way.
+    """
+    before, motion = index - 1, keyframes[index].motion
+    while motion is not None and before > 0 and keyframes[before].retired is not None:
+        earlier = keyframes[before].motion
+        motion = None if earlier is None else joined_motion(earlier, motion)
+        before -= 1
+    return before, motion if before >= 0 else None
+
+
 def factors_of(
     keyframes: Sequence[KeyframeRecord], slot: NDArray[np.intp], up_world: Up | None
 ) -> tuple[Factors, ...]:
@@ -443,9 +458,9 @@ def factors_of(
     """
     ends, ups = [], []
     for k in np.flatnonzero(slot >= 0).tolist():
-        motion, measured = keyframes[k].motion, keyframes[k].up
-        if k > 0 and motion is not None and slot[k - 1] >= 0:
-            ends.append((int(slot[k - 1]), int(slot[k]), motion))
+        (before, motion), measured = motion_before(keyframes, k), keyframes[k].up
+        if motion is not None and slot[before] >= 0:
+            ends.append((int(slot[before]), int(slot[k]), motion))
         if measured is not None and up_world is not None:
             ups.append((int(slot[k]), measured))
     levels = () if up_world is None else Levels.of(ups, up_world.direction)

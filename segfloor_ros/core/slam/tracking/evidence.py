@@ -29,6 +29,9 @@ ROUNDS = 4
 KNOWN_AS = 20.0
 """Measurements that what is known of the noise before counts as."""
 
+LARGEST_FACTOR = 4.0
+"""Of the noise: what errs by more is something else."""
+
 TAIL = 3.0
 """Degrees of freedom of a motion that is expected: large surprises happen (Student's t)."""
 
@@ -54,7 +57,7 @@ class Mixture:
         each. log_chance: (N,) logarithm of what is searched over what the noise fills. factor: of
         the noise, to begin with. missed: how many more were looked for, and gave no match.
         """
-        share, known = 0.5, KNOWN_AS
+        share, known, factor = 0.5, KNOWN_AS, min(factor, LARGEST_FACTOR)
         for _ in range(ROUNDS):
             log_right = log_chance - dimensions * math.log(factor) - chi2 / (2 * factor**2)
             right = share * np.exp(np.minimum(log_right, 700.0))
@@ -62,7 +65,7 @@ class Mixture:
             share = float((probability.sum() + 0.5) / (len(chi2) + missed + 1.0))
             total = float(probability @ np.where(probability > 0, chi2, 0.0))
             variance = (known + total) / (known + float(probability @ dimensions))
-            factor = math.sqrt(max(variance, 1.0))
+            factor = math.sqrt(min(max(variance, 1.0), LARGEST_FACTOR**2))
         log_right = log_chance - dimensions * math.log(factor) - chi2 / (2 * factor**2)
         right = share * np.exp(np.minimum(log_right, 700.0))
         log_ratio = float(np.log(1.0 - share + right).sum() + missed * math.log(1.0 - share))

@@ -16,17 +16,19 @@ from numpy.typing import NDArray
 from segfloor_ros.core.camera.model import StereoCamera, is_disparity
 from segfloor_ros.core.camera.pixels import Region, union
 from segfloor_ros.core.contracts import NO_POINT, BodySensors, LastPose, StereoFrame
-from segfloor_ros.core.geometry import Array, transform_points
+from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.places.place_recognition import (
     PlaceRecognition,
     Relocaliser,
     greatest_speed_mps,
     is_within,
 )
+from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.thresholds import MOST, SAME
 from segfloor_ros.core.slam.tracking.evidence import is_proof
+from segfloor_ros.core.slam.tracking.frame_to_frame import FrameToFrame
 from segfloor_ros.core.slam.tracking.images import FeatureExtractor, Features, Images, is_inside
 from segfloor_ros.core.slam.tracking.map_tracking import (
     USUAL_PX,
@@ -36,13 +38,8 @@ from segfloor_ros.core.slam.tracking.map_tracking import (
     Start,
     Tracker,
 )
-from segfloor_ros.core.slam.tracking.motion import (
-    CameraMotion,
-    ImageRotation,
-    TrackingState,
-    sigma_m,
-)
-from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE
+from segfloor_ros.core.slam.tracking.motion import CameraMotion, TrackingState, sigma_m
+from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE, with_patch_noise
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ, knows_more, refine_pose
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
@@ -60,9 +57,10 @@ class FrontEnd:
     def __init__(
         self, settings: StereoSlamSettings, sparse_map: SparseMap, body: BodySensors
     ) -> None:
-        self.motion = CameraMotion(body)
+        self.motion = CameraMotion(settings.max_speed_mps, body)
         self.local = LocalMap(sparse_map, settings.keyframe_max_frames)
         self.follower = Follower(sparse_map)
+        self.frame_to_frame = FrameToFrame(sparse_map.rig, settings.fast_threshold)
         self.tracker = Tracker(sparse_map)
         self.extractor = FeatureExtractor(settings)
         self.places = PlaceRecognition(sparse_map)
@@ -72,7 +70,6 @@ class FrontEnd:
         self._map = sparse_map
         self.relocaliser = Relocaliser(sparse_map, self.places)
         self.repeats = RepeatCheck()
-        self._rotation = ImageRotation(self._camera)
 
     @property
     def is_searching(self) -> bool:
@@ -85,6 +82,7 @@ class FrontEnd:
         """Begin anew in a map in which the camera must be found."""
         self.local.point_ids = np.zeros(0, np.int32)
         self.follower.reset()
+        self.frame_to_frame.reset()
         self.relocaliser.reset()
         self.motion.lose()
 
@@ -106,6 +104,7 @@ class FrontEnd:
     def follow_map(self, T_reference_before: Array, T_reference_after: Array) -> None:
         """Move along with a keyframe (T_camera_world, (4, 4)) that the map has moved."""
         self.motion.move_map(T_reference_before, T_reference_after)
+        self.frame_to_frame.move_map(invert(T_reference_before) @ T_reference_after)
         self.drop_dead()
 
     def drop_dead(self) -> None:
@@ -135,26 +134,42 @@ class FrontEnd:
         """Find the pose of a frame: from the one before, else by its features. found: where
         it is in this map, as that was found while the camera was in a submap.
         """
-        self._rotation.see(images.small)
         expected = self.motion.expected(frame.stamp_ns)
         if found is not None:
             features = self.extractor.extract(frame.left, images.excluded)
             track = self._relocalise(images, features, frame.stamp_ns, found)
         else:
             track = self._followed(frame, images, expected)
-        if track is None:
+        if track is not None and not self.motion.is_plausible(track.T_camera_world, frame.stamp_ns):
+            track = None
+        prior = self.motion.prior(frame.stamp_ns)
+        knows_less = track is not None and self._knows_less(track, expected, frame.stamp_ns)
+        # Images that know less than the sensors, and contradict them, show something else.
+        if track is None or (knows_less and not (track.fits(expected) and track.fits(prior))):
             self.follower.reset()
             return None
         track = replace(track, sigma_m=sigma_m(track.covariance))
-        T_seen = track.T_camera_world
-        track = self._weighed(replace(track, prior=self.motion.prior(frame.stamp_ns)))
+        T_seen = None if knows_less else track.T_camera_world
+        track = self._weighed(replace(track, prior=prior, is_weak=knows_less))
         self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
         self.follower.see(images, track.point_ids, track.uv_px)
+        self.frame_to_frame.see(frame, images, track.estimate)
+        if len(track.point_ids) == 0:
+            self.motion.since_keyframe.see(track.T_camera_world, track.covariance)
         self.local.move_to(track.point_ids, track.T_camera_world)
         if not self.is_fixed:
             self._map.points.note_tracking(track.visible_ids, track.point_ids)
         self.frames_since_keyframe += 1
         return track
+
+    def _knows_less(self, track: Track, expected: PoseEstimate | None, stamp_ns: int) -> bool:
+        """Whether sensors know some direction of the motion since the last pose better than the
+        images.
+        """
+        measured = None if self.motion.state.is_lost else self.motion.measured(stamp_ns)
+        if expected is None or measured is None:
+            return False
+        return knows_more(measured.covariance, track.estimate)
 
     def _followed(
         self, frame: StereoFrame, images: Images, expected: PoseEstimate | None
@@ -170,15 +185,40 @@ class FrontEnd:
         if followed is not None and followed.fits(expected) and reach_px < WIDE_PX:
             return followed
         features = self.extractor.extract(frame.left, images.excluded)
-        starts = self._starts(frame, features, followed, reach_px)
+        starts = self._starts(frame, images, features, followed, reach_px)
         found = self.tracker.best(images, features, self.local.point_ids, starts, expected)
         found = followed if found is None else found
+        if found is not None and expected is not None and reach_px < WIDE_PX:
+            found = self._standing(images, features, found, expected)
         if found is None and self.motion.state is not TrackingState.TRACKING:
-            return self._relocalise(images, features, frame.stamp_ns)
-        return found
+            found = self._relocalise(images, features, frame.stamp_ns)
+        return self._stepped(frame, images) if found is None else found
+
+    def _standing(
+        self, images: Images, features: Features, found: Track, expected: PoseEstimate
+    ) -> Track:
+        """Return, of a pose that was found and one near where it was expected, the likelier by the
+        records of their points of standing still: what comes close and fills the image has the most
+        points.
+        """
+        pose, around = expected.T_camera_world, self.local.point_ids
+        steady = self.tracker.track_at(images, features, around, pose)
+        if steady is None:
+            return found
+        of_steady, of_found = (
+            self.tracker.consensus.record(t.point_ids, t.T_camera_world).sum()
+            - t.estimate.surprise(expected)
+            for t in (steady, found)
+        )
+        return steady if of_steady > of_found else found
 
     def _starts(
-        self, frame: StereoFrame, features: Features, followed: Track | None, reach_px: float
+        self,
+        frame: StereoFrame,
+        images: Images,
+        features: Features,
+        followed: Track | None,
+        reach_px: float,
     ) -> Iterator[Start]:
         """Yield where the camera may be, what costs least first. reach_px: up to which points may
         be elsewhere than expected.
@@ -191,8 +231,20 @@ class FrontEnd:
         located = self.tracker.by_descriptors(features, self.local.point_ids)
         if located is not None:
             yield located
+        stepped = self.frame_to_frame.find(frame, images)
+        if stepped is not None:
+            yield Start(stepped.T_camera_world)
         yield from (Start(T_camera_world) for T_camera_world in predictions)
         yield Start(predictions[0], WIDE_PX)
+
+    def _stepped(self, frame: StereoFrame, images: Images) -> Track | None:
+        """Return the pose by the frame before alone: it shows no point of the map."""
+        estimate = self.frame_to_frame.find(frame, images)
+        if estimate is None:
+            return None
+        none = np.zeros(0, np.int32)
+        nothing = Observations(np.zeros((0, 3)), np.zeros((0, 3)))
+        return Track(replace(estimate, inliers=np.zeros(0, bool)), none, nothing, none)
 
     def _weighed(self, track: Track) -> Track:
         """Return a track with the likeliest pose by images and prior; that of the images where the
@@ -200,9 +252,8 @@ class FrontEnd:
         """
         prior = track.prior
         if prior is None or differ(track.estimate, prior):
-            return replace(track, prior=None, is_prior_better=False)
-        fused = _with_prior(self._map, track, prior)
-        return replace(track, estimate=fused, is_prior_better=knows_more(prior, fused))
+            return replace(track, prior=None)
+        return replace(track, estimate=_with_prior(self._map, track, prior))
 
     def bridge(self, frame: StereoFrame, fault: str) -> None:
         """Go on without the images, where the sensors allow it."""
@@ -214,10 +265,9 @@ class FrontEnd:
 
     def _predict_poses(self, frame: StereoFrame) -> list[Array]:
         """Return where the camera may be now, T_camera_world (4, 4) each, the likeliest first."""
-        turned = self._rotation.turn_since_last() @ self.motion.T_camera_world
         steady = self.motion.steady(frame.stamp_ns)
         measured = self.motion.measured_pose(frame.stamp_ns)
-        return [steady, turned] if measured is None else [measured, steady, turned]
+        return [steady] if measured is None else [measured, steady]
 
     def _relocalise(
         self, images: Images, features: Features, stamp_ns: int, found: Track | None = None
@@ -263,9 +313,9 @@ class FrontEnd:
         if track is not None and track.observed is not None:
             inside = is_inside(images.excluded, track.observed.features.uv_px)
             observed = track.observed.take(np.flatnonzero(~inside))
-            return observed
+            return _by_patches(images, observed) if track.is_weak else observed
         features = self.extractor.extract(frame.left, images.excluded)
-        if track is None:
+        if track is None or len(track.point_ids) == 0:
             if not self._map.keyframes:
                 self.motion.take(self.motion.T_camera_world, np.zeros((6, 6)), frame.stamp_ns)
             none = np.full(len(features), NO_POINT, np.int32)
@@ -278,9 +328,10 @@ class FrontEnd:
             return None
         assert matched.observed is not None
         weighed = self._weighed(replace(matched, prior=track.prior))
-        self.motion.T_camera_world = weighed.T_camera_world
+        if not (track.is_weak and track.prior is not None and weighed.prior is None):
+            self.motion.T_camera_world = weighed.T_camera_world
         self._map.points.note_tracking(matched.visible_ids, matched.point_ids)
-        return matched.observed
+        return _by_patches(images, matched.observed) if track.is_weak else matched.observed
 
     def continue_from(self, images: Images, keyframe: KeyframeRecord) -> None:
         """Track on from the points of a keyframe, old and new."""
@@ -299,6 +350,13 @@ def _with_prior(sparse_map: SparseMap, track: Track, prior: PoseEstimate) -> Pos
     start, camera = by_images.T_camera_world, sparse_map.rig.camera
     found = refine_pose(camera, start, points, seen, prior, is_noise_known=True)
     return replace(by_images, T_camera_world=found.T_camera_world, covariance=found.covariance)
+
+
+def _by_patches(images: Images, observed: ObservedFeatures) -> ObservedFeatures:
+    """Return the features of a frame that shows little, as sure as their patches are."""
+    is_matched = not images.depth_scale
+    observations = with_patch_noise(images.left, observed.observations, is_matched)
+    return replace(observed, observations=observations)
 
 
 def is_near(T_camera_world: Array, expected: PoseEstimate | None) -> bool:

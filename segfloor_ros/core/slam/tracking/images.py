@@ -319,7 +319,9 @@ def match_predicted(
     return one_to_one(points, near[points, best[points]], best_distance[points])
 
 
-def match_unguided(query: NDArray[np.uint8], train: NDArray[np.uint8]) -> Matches:
+def match_unguided(
+    query: NDArray[np.uint8], train: NDArray[np.uint8], max_hamming: int = MAX_HAMMING
+) -> Matches:
     """Match descriptors (N, 32) and (M, 32) by mutual nearest neighbours; returns (query rows,
     train rows).
     """
@@ -327,7 +329,7 @@ def match_unguided(query: NDArray[np.uint8], train: NDArray[np.uint8]) -> Matche
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(query, train)
     pairs = np.array(
-        [(m.queryIdx, m.trainIdx) for m in found if m.distance <= MAX_HAMMING], np.intp
+        [(m.queryIdx, m.trainIdx) for m in found if m.distance <= max_hamming], np.intp
     ).reshape(-1, 2)
     return pairs[:, 0], pairs[:, 1]
 

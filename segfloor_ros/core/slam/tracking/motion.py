@@ -1,31 +1,21 @@
-"""The motion of the camera: where it is, where it will be next, and the continuous frame `odom`.
-
-How far the camera turned since the last image, from the images alone: on a thumbnail a rotation
-looks like a shift. It is found without features by phase correlation, so that tracking survives a
-turn that its motion model did not foresee (the "small blurry image" of Klein and Murray, Improving
-the Agility of Keyframe-Based SLAM, 2008).
-"""
+"""The motion of the camera: where it is, where it will be next, and the continuous frame `odom`."""
 
 from __future__ import annotations
 
 from enum import Enum
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import BodySensors, LastPose, RelativeMotion
-from segfloor_ros.core.geometry import Array, invert, make_transform, rotation_from_angles
+from segfloor_ros.core.geometry import Array, invert, make_transform
 from segfloor_ros.core.slam.thresholds import SAME, SPEED_SIGMA
-from segfloor_ros.core.slam.tracking.images import SMALL_WIDTH_PX
 from segfloor_ros.core.slam.tracking.pose import ANYWHERE, PoseEstimate
-from segfloor_ros.core.twists import adjoint, se3_exp, se3_log, without_drift
+from segfloor_ros.core.twists import adjoint, is_within, se3_exp, se3_log, without_drift
 
 MIN_STEP_S = 1e-3
 
-MIN_RESPONSE = 0.05
-"""Of the phase correlation of two images that have something in common."""
+MAX_TURN_RADPS = 6.0
+"""A robot does not spin faster than once a second."""
 
 ACCELERATION = 2.0
 """Of a robot on wheels, m/s² and rad/s², until its motion shows another one."""
@@ -74,8 +64,9 @@ class CameraMotion:
     while it is lost, `T_camera_world` turns on as a gyroscope measures.
     """
 
-    def __init__(self, body: BodySensors) -> None:
+    def __init__(self, max_speed_mps: float, body: BodySensors) -> None:
         self._body = body
+        self._max_speed_mps = max_speed_mps
         self.reset()
 
     def reset(self) -> None:
@@ -144,6 +135,16 @@ class CameraMotion:
             covariance[:3, :3] += (SPEED_SIGMA * step_s) ** 2 * np.eye(3)
         return _estimate(pose, covariance)
 
+    def is_plausible(self, T_camera_world: Array, stamp_ns: int) -> bool:
+        """Whether a robot can have come to a pose since the last frame; of a lost one nothing is
+        known.
+        """
+        if self.state.is_lost or self.state.is_resuming:
+            return True
+        motion = T_camera_world @ invert(self.T_camera_world)
+        step_s = _step_s(self._last_stamp_ns, stamp_ns)
+        return is_within(motion, (self._max_speed_mps * step_s, MAX_TURN_RADPS * step_s))
+
     def _expected_lost(self, stamp_ns: int) -> PoseEstimate | None:
         turned = self._turned(stamp_ns)
         if turned is None or self._heading_sigma_rad is None:
@@ -181,8 +182,9 @@ class CameraMotion:
         self, T_camera_world: Array, covariance: Array, stamp_ns: int, T_seen: Array | None = None
     ) -> None:
         """Go on from the pose of a frame, found in its images. T_seen: (4, 4), as the images alone
-        have it: the sensors learn from that. After a blind stretch `odom` goes on where the sensors
-        had the camera: the error of the stretch is a correction of `odom`.
+        have it, where they know it better than the sensors: these learn from that. After a blind
+        stretch `odom` goes on where the sensors had the camera: the error of the stretch is a
+        correction of `odom`.
         """
         measured = self.measured(stamp_ns)
         predicted = self._predicted(measured)
@@ -199,9 +201,13 @@ class CameraMotion:
         self.T_camera_world, self.covariance = T_camera_world, covariance
         self._last_stamp_ns = stamp_ns
         self.state = TrackingState.TRACKING
-        T_seen = T_camera_world if T_seen is None else T_seen
-        T_odom_seen = invert(self.T_world_odom) @ invert(T_seen)
-        self._body.learn(stamp_ns, T_odom_seen, self.T_world_odom[:3, :3])
+        R_world_odom = self.T_world_odom[:3, :3]
+        if T_seen is not None or measured is None:
+            T_seen = T_camera_world if T_seen is None else T_seen
+            T_odom_seen = invert(self.T_world_odom) @ invert(T_seen)
+            self._body.learn(stamp_ns, T_odom_seen, R_world_odom)
+        else:
+            self._body.carry(stamp_ns, self.T_odom_camera, R_world_odom, measured.by_wheels)
 
     def bridge(self, stamp_ns: int) -> bool:
         """Go on without the images to where the sensors have the camera. Returns whether they
@@ -293,7 +299,7 @@ class Surprises:
 
     def __init__(self) -> None:
         self._squares = np.full(2, ACCELERATION**2)
-        self._count = LEARNT_FROM / 3
+        self._count = LEARNT_FROM / 10
 
     def learn(self, error: Array, step_s: float) -> None:
         """Take in the error (6,) of a motion that was expected to go on."""
@@ -317,14 +323,21 @@ class KeyframeMotion:
         self.motion: RelativeMotion | None = None
 
     def start(self, T_camera_world: Array, covariance: Array) -> RelativeMotion | None:
-        """Begin at a keyframe; returns the motion before it, if wheels measured it."""
+        """Begin at a keyframe; returns the motion before it, if wheels measured it, or images
+        alone without the map."""
         before, self.motion = self.motion, RelativeMotion.none()
         self.T_camera_world, self.covariance = T_camera_world, covariance
-        return before if before is not None and before.by_wheels else None
+        return before if before is not None and before.source in ('wheels', 'images') else None
 
     def add(self, measured: RelativeMotion | None) -> None:
         """Add the motion of a frame."""
         self.motion = joined_motion(self.motion, measured) if self.motion and measured else None
+
+    def see(self, T_camera_world: Array, covariance: Array) -> None:
+        """Take in a pose (4, 4) that images show without the map, with its covariance (6, 6)."""
+        if self.motion is None or not self.motion.by_wheels:
+            T_now_keyframe = T_camera_world @ invert(self.T_camera_world)
+            self.motion = RelativeMotion(T_now_keyframe, covariance, 'images')
 
     def moved(self, measured: RelativeMotion) -> tuple[Array, Array] | None:
         """Return the pose after the motion by wheels so far and one of a frame, with covariance."""
@@ -360,43 +373,3 @@ def _step_s(before_ns: int, now_ns: int) -> float:
 def sigma_m(covariance: Array) -> float:
     """Return the standard deviation of the place of a pose with a covariance (6, 6)."""
     return float(np.sqrt(np.diag(covariance)[:3].max()))
-
-
-class ImageRotation:
-    """Compares each image with the one before."""
-
-    def __init__(self, camera: StereoCamera) -> None:
-        scale = SMALL_WIDTH_PX / 4 / camera.width
-        height = max(8, round(camera.height * scale))
-        self._size = (SMALL_WIDTH_PX // 4, height)
-        self._window = cv2.createHanningWindow(self._size, cv2.CV_32F)
-        self._focal = (camera.fx * scale, camera.fy * height / camera.height)
-        self._last: NDArray[np.uint8] | None = None
-        self._now: NDArray[np.uint8] | None = None
-
-    def see(self, image: NDArray[np.uint8]) -> None:
-        """Take in the next image (H, W), shrunk as optical flow takes it."""
-        self._last, self._now = self._now, image
-
-    def turn_since_last(self) -> Array:
-        """Return T_now_last (4, 4) between the last two images, a rotation about the camera's
-        centre.
-
-        The identity where there was no image before, or where the two have too little in common.
-        """
-        if self._last is None or self._now is None:
-            return np.eye(4)
-        last, now = (
-            cv2.GaussianBlur(
-                cv2.resize(image, self._size, interpolation=cv2.INTER_AREA).astype(np.float32),
-                (0, 0),
-                0.75,
-            )
-            for image in (self._last, self._now)
-        )
-        (du, dv), response = cv2.phaseCorrelate(last, now, self._window)
-        if response < MIN_RESPONSE:
-            return np.eye(4)
-        # A scene point that moves right by du lies further to the right now: it turned about +y.
-        turned_down, turned_left = np.arctan2((-dv, du), self._focal[::-1])
-        return make_transform(rotation_from_angles(0.0, turned_left, turned_down), np.zeros(3))

@@ -17,12 +17,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from segfloor_ros.core.camera.pixels import disparity_at
+from segfloor_ros.core.camera.pixels import SUBPIXEL, disparity_at
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.slam.rig import Observations
+from segfloor_ros.core.slam.rig import MAX_DISPARITY_SHARE, Observations
 from segfloor_ros.core.slam.thresholds import MAJORITY
-from segfloor_ros.core.slam.tracking.images import SIDE_PX, Images
+from segfloor_ros.core.slam.tracking.images import SIDE_PX, SMALL_WIDTH_PX, Images
 from segfloor_ros.core.timing import timed
 
 HALF_PATCH_PX = SIDE_PX // 2
@@ -44,6 +45,9 @@ ALIGNED_PX, MAX_SHIFT_STEP_PX = 2.0, 1.0
 
 MIN_SIGMA_PIXEL, MIN_SIGMA_DISPARITY = 0.15, 0.1
 """No patch is measured better: lenses, rectification and the shape of things are not perfect."""
+
+MIN_TEXTURE = 5
+"""Of a block that is matched roughly, in units of OpenCV."""
 
 MIN_CORRELATION = 0.7
 """Of the patches of one point in both images."""
@@ -404,3 +408,41 @@ def refine_disparity(
     disparity[rows] = uv_px[rows, 0] - found_u
     sigma[rows] = found.sigma_px[found.sound, 0]
     return disparity, sigma
+
+
+def with_patch_noise(
+    image: NDArray[np.float32], observations: Observations, is_matched: bool
+) -> Observations:
+    """Return observations (N) that have at least the noise that the patches of a grey image (H, W)
+    around them allow, and share what patches that overlap know. is_matched: whether disparities
+    are.
+    """
+    uv_px = observations.uvd_px[:, :2]
+    if len(uv_px) == 0:
+        return observations
+    fit = _Fit.of(sample_patches(image, uv_px), 2)
+    crowd = cKDTree(uv_px).query_ball_point(uv_px, HALF_PATCH_PX, return_length=True)
+    level = GREY_NOISE**2 * float(WINDOW.max()) * np.asarray(crowd, np.float64)
+    by_u, by_v = known_shift(fit.H[::3, ::3]) * level
+    by_d = known_shift(fit.H[:1, :1]) * level * is_matched
+    least = np.sqrt(np.column_stack([by_u, by_v, by_d[0]]))
+    return replace(observations, sigma_px=np.maximum(observations.sigma_px, least))
+
+
+def guess_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], uv_px: Array) -> Array:
+    """Return about the disparity (N,) px at pixels (N, 2) of the left image; NaN where none is
+    found. left, right: rectified grey images (H, W).
+    """
+    factor = max(1, round(left.shape[1] / SMALL_WIDTH_PX))
+    size = (left.shape[1] // factor, left.shape[0] // factor)
+    count = -(-round(MAX_DISPARITY_SHARE * size[0]) // SUBPIXEL) * SUBPIXEL
+    matcher = cv2.StereoBM_create(count, SIDE_PX)
+    matcher.setTextureThreshold(MIN_TEXTURE)
+    matcher.setUniquenessRatio(0)
+    # Without a margin the matcher leaves the leftmost columns empty.
+    small = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, right))
+    wide = (cv2.copyMakeBorder(i, 0, 0, count, 0, cv2.BORDER_REPLICATE) for i in small)
+    disparity = matcher.compute(*wide)[:, count:]
+    column, row = ((uv_px.T + 0.5) / factor).astype(np.intp)
+    at = disparity[np.clip(row, 0, size[1] - 1), np.clip(column, 0, size[0] - 1)]
+    return np.where(at > 0, at * (factor / SUBPIXEL), np.nan)

@@ -124,13 +124,20 @@ class PoseEstimate:
         information = np.linalg.inv(self.covariance)
         if expected is None:
             return self.log_ratio - gained(information, ANYWHERE)
+        of_prior = gained(information, expected.covariance) + self.surprise(expected)
+        return self.log_ratio - of_prior
+
+    def surprise(self, expected: PoseEstimate) -> float:
+        """Return by how many nats the pose is less likely than one just as expected."""
         error = se3_log(self.T_camera_world @ invert(expected.T_camera_world))
-        of_prior = surprise(error, expected.covariance + self.covariance)
-        return self.log_ratio - gained(information, expected.covariance) - of_prior
+        return surprise(error, expected.covariance + self.covariance)
 
 
 def solve_pnp(
-    camera: StereoCamera, points_world: Array, uv_px: NDArray[np.floating]
+    camera: StereoCamera,
+    points_world: Array,
+    uv_px: NDArray[np.floating],
+    iterations: int = RANSAC_ITERATIONS,
 ) -> tuple[Array, NDArray[np.bool_]] | None:
     """Find T_camera_world from points (N, 3) and pixels (N, 2) by PnP in RANSAC, or None.
 
@@ -145,7 +152,7 @@ def solve_pnp(
         np.ascontiguousarray(uv_px, np.float64),
         camera.K,
         None,
-        iterationsCount=RANSAC_ITERATIONS,
+        iterationsCount=iterations,
         reprojectionError=SAME_PX,
         confidence=0.999,
         flags=cv2.SOLVEPNP_AP3P,
@@ -166,6 +173,7 @@ def refine_pose(
     prior: PoseEstimate | None = None,
     searched: Searched = WHOLE,
     is_noise_known: bool = False,
+    first: NDArray[np.bool_] | None = None,
 ) -> PoseEstimate:
     """Refine a pose by Levenberg-Marquardt on (u, v, d) with a Huber cost, dropping outliers
     between rounds.
@@ -174,10 +182,10 @@ def refine_pose(
     and a poor calibration make errors larger than the sigmas of single measurements; a mixture of
     right and wrong matches shows by how much, and the bound on outliers follows it, unless the
     noise is known. prior: the pose by other sensors; it adds what the points do not determine.
-    searched: where the matches were looked for.
+    searched: where the matches were looked for. first: which (N,) agree with the pose at the start.
     """
     seen = _Seen.of(camera, points_world, observations)
-    inliers = np.ones(len(points_world), bool)
+    inliers = np.ones(len(points_world), bool) if first is None else first
     if prior is not None and not len(points_world):
         return replace(prior, inliers=inliers)
     known = _Prior() if prior is None else _Prior.of(prior)
@@ -354,13 +362,13 @@ class _State:
         return stepped
 
 
-def knows_more(prior: PoseEstimate, fused: PoseEstimate) -> bool:
-    """Whether a prior knows some direction of a pose better than the points with which it was
-    fused.
+def knows_more(covariance: Array, by_images: PoseEstimate) -> bool:
+    """Whether sensors, with the covariance (6, 6) of what they measure, know some direction of a
+    pose better than the images.
     """
-    known = np.linalg.inv(prior.covariance)
-    by_points = np.linalg.inv(fused.covariance) - known + np.diag(FIRST_INFORMATION)
-    return bool(np.linalg.eigvals(np.linalg.solve(by_points, known)).real.max() > 1)
+    known = np.linalg.inv(covariance + SMALLEST * np.eye(6))
+    seen = np.linalg.inv(by_images.covariance) + np.diag(FIRST_INFORMATION)
+    return bool(np.linalg.eigvals(np.linalg.solve(seen, known)).real.max() > 1)
 
 
 class Consensus:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.tracking.images import Features
@@ -23,6 +24,14 @@ class ObservedFeatures:
     observations: Observations
     point_id: NDArray[np.int32]
 
+    @property
+    def known_share(self) -> float:
+        """The share of the points that the frame shows which the map knew before: what is new lies
+        where the camera has it, and shares its error.
+        """
+        known = self.point_id != NO_POINT
+        return float(known.sum() / max(1, (known | self.observations.has_disparity).sum()))
+
     def take(self, rows: NDArray[np.intp]) -> ObservedFeatures:
         """Return the chosen rows."""
         return ObservedFeatures(
@@ -38,7 +47,8 @@ class Track:
     measured. visible_ids: those that were looked for. observed: set when the pose was found by
     features. sigma_m: how uncertain the image
     leaves the place on the axis where it is most, 0 where it shows plenty. prior: the pose that
-    wheels measured, where the image does not contradict it; is_prior_better: in some direction.
+    wheels measured, where the image does not contradict it. is_weak: whether sensors know some
+    direction of the motion better.
     """
 
     estimate: PoseEstimate
@@ -48,7 +58,7 @@ class Track:
     observed: ObservedFeatures | None = None
     sigma_m: float = 0.0
     prior: PoseEstimate | None = None
-    is_prior_better: bool = False
+    is_weak: bool = False
 
     @property
     def T_camera_world(self) -> Array:
