@@ -304,7 +304,8 @@ class FrontEnd:
         features = self.extractor.extract(frame.left, images.excluded)
         if track is None or len(track.point_ids) == 0:
             if not self._map.keyframes:
-                self.motion.take(self.motion.T_camera_world, np.zeros((6, 6)), frame.stamp_ns)
+                first = self.motion.T_camera_world
+                self.motion.take(first, np.zeros((6, 6)), frame.stamp_ns, T_seen=first)
             none = np.full(len(features), NO_POINT, np.int32)
             return ObservedFeatures(features, self.tracker.pixel_observations(features), none)
         pose = self.motion.T_camera_world

@@ -186,8 +186,9 @@ def refine_pose(
     """
     seen = _Seen.of(camera, points_world, observations)
     inliers = np.ones(len(points_world), bool) if first is None else first
-    if prior is not None and not len(points_world):
-        return replace(prior, inliers=inliers)
+    if not len(points_world):
+        unknown = PoseEstimate(T_camera_world, inliers, np.eye(6) * UNKNOWN_COVARIANCE, 1.0)
+        return replace(prior or unknown, inliers=inliers)
     known = _Prior() if prior is None else _Prior.of(prior)
     log_chance = searched.log_chance(camera, observations)
     mixture: Mixture | None = None

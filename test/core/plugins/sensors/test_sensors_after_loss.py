@@ -1,5 +1,7 @@
 """A camera that was lost is found somewhere else: the way there is no measurement of any sensor."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import pytest
 from stereo_room import planar_pose
@@ -27,10 +29,10 @@ def standing_with_imu(until_ms: int) -> CameraMotion:
     return CameraMotion(2.0, body)
 
 
-def see(motion: CameraMotion, milliseconds: range, T_world_camera: np.ndarray) -> None:
+def see(motion: CameraMotion, milliseconds: Iterable[int], T_world_camera: np.ndarray) -> None:
     """Let the images show a camera that stands."""
     for t in milliseconds:
-        motion.take(invert(T_world_camera), SURE, t * MS)
+        motion.take(invert(T_world_camera), SURE, t * MS, T_seen=invert(T_world_camera))
 
 
 @pytest.mark.parametrize('source', ['IMU', 'gyroscope'])
@@ -92,8 +94,7 @@ def driven_and_lost(lag_s: float, is_found_turned: bool) -> BodyMotion:
             motion.lose(100 * k * MS)
             T_odom_first = elsewhere @ T_odom_first
             continue
-        T_world_camera = T_odom_first @ base(0.1 * k) @ MOUNT.T_base_left
-        motion.take(invert(T_world_camera), SURE, 100 * k * MS)
+        see(motion, [100 * k], T_odom_first @ base(0.1 * k) @ MOUNT.T_base_left)
     return body
 
 

@@ -46,8 +46,8 @@ def fused(image, uv_px, prior=NOTHING, depth_m=2.0):
     points = CAMERA.back_project(uv_px, np.full(len(uv_px), depth_m))
     disparity = np.full(len(uv_px), CAMERA.disparity_times_depth / depth_m)
     sure = Observations(np.column_stack([uv_px, disparity]), np.full((len(uv_px), 3), 0.01))
-    measured = with_patch_noise(image, sure)
-    return refine_pose(CAMERA, np.eye(4), points, measured, 1.0, prior)
+    measured = with_patch_noise(image.astype(np.float32), sure, is_matched=True)
+    return refine_pose(CAMERA, np.eye(4), points, measured, prior, is_noise_known=True)
 
 
 def sigmas_m(image, uv_px):
@@ -114,12 +114,11 @@ def test_a_prior_is_outdone_where_points_know_every_direction_better():
     on_edge = np.stack([np.full(len(rows), MIDDLE[0]), rows], axis=1)
     edge = noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0)), on_edge
     texture = noisy(RNG.uniform(60, 160, U.shape)), anywhere(300)
-    none, wide = np.zeros(0, bool), np.diag([0.02] * 6) ** 2
+    wide = np.diag([0.02] * 6) ** 2
     sure_of_turns = np.diag([0.02] * 3 + [1e-5] * 3) ** 2
-    of_wheels, of_gyroscope = (PoseEstimate(np.eye(4), none, P, 1.0) for P in (wide, sure_of_turns))
-    assert knows_more(of_wheels, fused(*edge, of_wheels))
-    assert not knows_more(of_wheels, fused(*texture, of_wheels))
-    assert knows_more(of_gyroscope, fused(*texture, of_gyroscope))
+    assert knows_more(wide, fused(*edge))
+    assert not knows_more(wide, fused(*texture))
+    assert knows_more(sure_of_turns, fused(*texture))
 
 
 def test_pixels_are_as_sure_with_wheels_as_without_where_the_images_know_more():
@@ -144,16 +143,18 @@ def test_pixels_are_as_sure_with_wheels_as_without_where_the_images_know_more():
 def test_measured_depth_is_as_sure_on_an_edge_as_elsewhere():
     image = noisy(np.where(V - MIDDLE[1] > 0, 150.0, 100.0))
     sure = Observations(np.array([[*MIDDLE, 10.0]]), np.full((1, 3), 0.5))
-    by_images, by_depth = (with_patch_noise(image, sure, matched) for matched in (True, False))
+    by_images, by_depth = (
+        with_patch_noise(image.astype(np.float32), sure, matched) for matched in (True, False)
+    )
     assert by_images.sigma_px[0, 2] > 3.0 and by_depth.sigma_px[0, 2] == 0.5
 
 
 def test_a_prior_leaves_the_noise_of_the_images_as_it_is(monkeypatch):
     weigh, weighed = FrontEnd._weighed, []
 
-    def weigh_blurred(front_end, track, images):
+    def weigh_blurred(front_end, track):
         blurred = replace(track, estimate=replace(track.estimate, noise_factor=3.0))
-        weighed.append(weigh(front_end, blurred, images))
+        weighed.append(weigh(front_end, blurred))
         return weighed[-1]
 
     monkeypatch.setattr(FrontEnd, '_weighed', weigh_blurred)
@@ -171,7 +172,8 @@ def test_a_prior_leaves_the_noise_of_the_images_as_it_is(monkeypatch):
 def test_a_pixel_on_an_edge_is_sure_across_it_alone():
     image = noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0))
     uvd_px = np.array([[MIDDLE[0], MIDDLE[1], np.nan]])
-    sigma_px = with_patch_noise(image, Observations(uvd_px, np.full((1, 3), 0.5))).sigma_px[0]
+    sure = Observations(uvd_px, np.full((1, 3), 0.5))
+    sigma_px = with_patch_noise(image.astype(np.float32), sure, is_matched=True).sigma_px[0]
     assert sigma_px[0] == 0.5 and sigma_px[1] > 3.0
 
 
