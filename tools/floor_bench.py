@@ -300,7 +300,7 @@ def write_sheet(folder: Path, drive: FloorDrive, masks: dict[int, Mask], row: Be
         alone = BenchRow(row.name, row.group, [one])
         figures = (alone.share('whole', name) for name in ('precision', 'recall', 'obstacles'))
         text = f'{row.name} {one.index}: ' + ' / '.join(f'{value:.1f}' for value in figures)
-        cv2.putText(picture, text, (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 4)
+        picture[:30] //= 3
         cv2.putText(picture, text, (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1)
         pictures.append(picture)
     pictures += [np.zeros_like(pictures[0])] * (len(pictures) % 2)

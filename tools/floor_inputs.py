@@ -21,11 +21,7 @@ from segfloor_ros.apps.evaluation.floor import draw_outline, read_outlines
 from segfloor_ros.apps.simulation.motion import RigMotion, plan_drive
 from segfloor_ros.apps.simulation.scene import Scene
 from segfloor_ros.apps.simulation.scene_file import open_scene, scene_from_mapping
-from segfloor_ros.apps.simulation.simulation import (
-    DISPARITY_SCALE,
-    RecordingOptions,
-    render_once,
-)
+from segfloor_ros.apps.simulation.simulation import DISPARITY_SCALE, RecordingOptions, render_once
 from segfloor_ros.apps.simulation.solids import CLASSES, floors
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.configuration import Configuration
@@ -180,7 +176,8 @@ class FloorDrive:
             **{name: [getattr(truth, name) for truth in truths] for name in _TRUTH},
         }
         file.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(file, **{name: np.array(values) for name, values in arrays.items()})
+        arrays = {name: np.array(values) for name, values in arrays.items()}
+        np.savez(file, **arrays)
 
     @classmethod
     def read(cls, file: Path, key: str) -> FloorDrive | None:
@@ -231,7 +228,8 @@ def make_drive(bench: BenchDrive, cache: Path, lead_in: int, announce: Announce)
     recording = bench.source
     if isinstance(recording, Scene):
         recording = _rendered(bench, recording, cache, announce)
-    configuration = resolve(None, (), stereo_camera={'input': str(recording)}, stereo_slam=bench.slam)
+    camera = {'input': str(recording)}
+    configuration = resolve(None, (), stereo_camera=camera, stereo_slam=bench.slam)
     source = open_recording(recording, configuration)
     truths = dict(_truths(bench, recording, source.camera))
     wanted = {i for scored in truths for i in range(scored - lead_in, scored + 1)}

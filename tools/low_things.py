@@ -8,6 +8,7 @@ the light is low, or the images have noise of 4 grey levels. Sizes and places fo
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,8 @@ HALF_WIDTH_M, END_M = 1.5, 6.0
 """Of the lane."""
 WAY_M = 1.9
 """The drive ends here; at 0.4 m/s and 10 Hz it has about 60 frames."""
+LEVEL_M = 0.5
+"""Up to here a bumpy floor is level, so that the map is, too."""
 FREE_M = 0.3
 """Nothing stands so close to the way; a step of 3 cm would be in the robot's way."""
 TRIES = 4000
@@ -125,7 +128,7 @@ def bumps(height_m: float, rng: Rng) -> tuple[Array, Array]:
     knots_m = np.linspace(-1.0, END_M, count)
     knots_m[1:-1] += rng.uniform(-0.08, 0.08, count - 2)
     heights_m = rng.uniform(0.0, height_m, count)
-    heights_m[[0, -1]] = 0.0
+    heights_m[(knots_m < LEVEL_M) | (knots_m == END_M)] = 0.0
     return np.round(knots_m, 3), np.round(heights_m, 4)
 
 
@@ -134,7 +137,7 @@ def _slopes(knots_m: Array, heights_m: Array, texture: str) -> list[Values]:
     width_m = 2 * HALF_WIDTH_M
     return [
         {'start': a, 'end': b, 'width_m': width_m, 'texture': texture}
-        for a, b in zip(ends[:-1], ends[1:], strict=True)
+        for a, b in itertools.pairwise(ends)
     ]
 
 
@@ -161,9 +164,7 @@ def _is_clear(thing: Thing, others: list[Thing]) -> bool:
 def _outline(thing: Thing) -> Array:
     """Return points (N, 2) that cover a thing's footprint."""
     yaw = np.radians(thing.yaw_deg)
-    along, across = (
-        np.linspace(-half, half, max(2, round(half / 0.04))) for half in thing.half_m
-    )
+    along, across = (np.linspace(-half, half, max(2, round(half / 0.04))) for half in thing.half_m)
     grid = np.stack(np.meshgrid(along, across), axis=-1).reshape(-1, 2)
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     return np.asarray(grid @ turn.T + thing.at)
