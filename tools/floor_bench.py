@@ -50,12 +50,11 @@ from tools.recorded_frames import CACHE
 Mask = NDArray[np.uint8]
 
 BENCH_CACHE = CACHE / 'floor_bench'
-LEAD_IN = 2
-"""Frames segmented before each scored one: what the black border needs (`BlankBorder`)."""
-
 PARTS = ('whole', 'near')
 COUNTS = ('true_floor', 'false_floor', 'missed_floor', 'obstacle_as_floor', 'obstacle')
-WIDTH, SHEET_FRAMES, PICTURE_PX = 150, 6, 640
+"""What is counted in each part of the image, in this order."""
+
+WIDTH, SHEET_FRAMES, PICTURE_PX, TILES = 150, 6, 640, 4
 OBSTACLE_WEIGHT = 4.0
 """Of a pixel of an obstacle called floor, against one of floor that is missed: a robot collides."""
 
@@ -130,9 +129,6 @@ def floor_bench(
     assignments: Set = None,
     data: Annotated[Path, typer.Option(help='Folder of the recordings.')] = DATA,
     cache: Annotated[Path, typer.Option(help='Folder for what is made once.')] = BENCH_CACHE,
-    lead_in: Annotated[
-        int, typer.Option(min=0, help='Frames that are segmented before each scored one.')
-    ] = LEAD_IN,
     fresh: Annotated[bool, typer.Option('--fresh', help='Make the inputs anew.')] = False,
 ) -> None:
     """Score the floor masks of all drives and print a row for each."""
@@ -140,16 +136,18 @@ def floor_bench(
     drives = _chosen(bench_drives(data.resolve()), only)
     configuration, rows = resolve(None, assignments or ()), []
     cv2.setNumThreads(1)
-    took_s = 0.0
+    took_s, worst = 0.0, []
     with announcing() as announce:
         for bench in drives:
-            inputs = floor_drive(bench, cache.expanduser(), lead_in, fresh, announce)
+            inputs = floor_drive(bench, cache.expanduser(), fresh, announce)
             start_s = time.process_time()
             masks, row = segment(bench, inputs, configuration)
             took_s += time.process_time() - start_s
             rows.append(row)
             if sheet:
-                write_sheet(sheet, inputs, masks, row)
+                worst.append(write_sheet(sheet, inputs, masks, row))
+    if sheet:
+        cv2.imwrite(str(sheet / 'worst.png'), tiles(worst))
     if json_file:
         found = {'rows': [dataclasses.asdict(row) for row in rows]}
         json_file.write_text(json.dumps(found) + '\n')
@@ -288,8 +286,8 @@ def rows_by_name(file: Path) -> dict[str, BenchRow]:
     return {row.name: row for row in rows}
 
 
-def write_sheet(folder: Path, drive: FloorDrive, masks: dict[int, Mask], row: BenchRow) -> None:
-    """Write the worst frames of a drive as one picture, the worst first."""
+def write_sheet(folder: Path, drive: FloorDrive, masks: dict[int, Mask], row: BenchRow) -> Mask:
+    """Write the worst frames of a drive as one picture, the worst first; returns that one."""
     frames = {frame.index: frame for frame in drive.frames}
     worst = sorted(row.frames, key=lambda frame: -frame.badness)[:SHEET_FRAMES]
     pictures = []
@@ -307,6 +305,21 @@ def write_sheet(folder: Path, drive: FloorDrive, masks: dict[int, Mask], row: Be
     folder.mkdir(parents=True, exist_ok=True)
     pairs = (np.hstack(pictures[i : i + 2]) for i in range(0, len(pictures), 2))
     cv2.imwrite(str(folder / f'{row.name}.png'), np.vstack(list(pairs)))
+    return pictures[0]
+
+
+def tiles(pictures: Sequence[Mask]) -> Mask:
+    """Return pictures (h, w, 3) of one width, half as large, side by side in rows."""
+    small = [
+        cv2.resize(one, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for one in pictures
+    ]
+    height, width = max(one.shape[0] for one in small), small[0].shape[1]
+    rows = -(-len(small) // TILES)
+    whole = np.zeros((rows * height, TILES * width, 3), np.uint8)
+    for i, one in enumerate(small):
+        v, u = i // TILES * height, i % TILES * width
+        whole[v : v + one.shape[0], u : u + width] = one
+    return whole
 
 
 def error_picture(left: Mask, mask: Mask, truth: Truth) -> Mask:

@@ -26,6 +26,7 @@ from tools.floor_bench import (
     rows_by_name,
     segment,
     table_of,
+    tiles,
     write_sheet,
 )
 from tools.floor_inputs import (
@@ -153,8 +154,9 @@ def test_a_drive_comes_back_from_disk_and_is_segmented(tmp_path) -> None:
     masks, row = segment(BenchDrive('room', 'rooms', tmp_path), read, resolve())
     assert [frame.index for frame in row.frames] == [*masks] == [2]
     assert row.share('near', 'recall') > 80
-    write_sheet(tmp_path / 'sheets', read, masks, row)
+    worst = write_sheet(tmp_path / 'sheets', read, masks, row)
     assert cv2.imread(str(tmp_path / 'sheets' / 'room.png')).shape[1] == 2 * 640
+    assert tiles([worst] * 5).shape[0] == 2 * (worst.shape[0] // 2)
 
 
 def test_drives_without_a_recording_are_left_out(tmp_path) -> None:
@@ -164,7 +166,7 @@ def test_drives_without_a_recording_are_left_out(tmp_path) -> None:
     (tmp_path / 'rover').mkdir()
     rover = next(one for one in bench_drives(tmp_path) if one.name == 'rover')
     assert rover.outlines.is_file()
-    assert rover.key(2) != rover.key(3)
+    assert dataclasses.replace(rover, lead_in=3).key != rover.key
 
 
 @pytest.mark.parametrize('name', SCENES)
