@@ -10,12 +10,14 @@ from scipy.spatial.transform import Rotation
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.contracts import ImuSample, StereoFrame, WheelPose
-from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.geometry import invert, make_transform, transform_points
 from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.settings import StereoSlamSettings
+from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 from segfloor_ros.core.slam.tracking.images import Images
-from segfloor_ros.core.slam.tracking.pose import PoseEstimate
+from segfloor_ros.core.slam.tracking.patch_alignment import with_patch_noise
+from segfloor_ros.core.slam.tracking.pose import refine_pose
 from segfloor_ros.core.slam.tracking.track import Track
 
 SETTINGS = StereoSlamSettings(num_features=800)
@@ -155,26 +157,50 @@ def test_a_wrong_scale_is_said_and_taken_into_account():
     np.testing.assert_allclose(motion.T_now_before, expected, atol=0.005)
 
 
-def test_points_that_slide_along_an_edge_do_not_outweigh_wheels(on_wheels):
-    slam, _ = on_wheels
-    for measured in wheel_poses()[5 * FRAMES - 4 :]:
-        slam.add(measured)
+def on_edge_and_anywhere():
+    """Return two pictures, of an edge and of a texture, and pixels (N, 2) on the edge, or
+    anywhere.
+    """
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    rng, edge_px = np.random.default_rng(1), 0.5 * CAMERA.width + 0.3 * (v[:, 0] - 50)
-    rows = rng.integers(20, CAMERA.height - 20, 150)
-    on_edge = np.stack([edge_px[rows], rows], axis=1)
-    pose, sure = slam.front_end.motion.predict(round(FRAMES * 1e8)), 1e-6 * np.eye(6)
-    estimate = PoseEstimate(pose, np.ones(150, bool), sure, 1.0)
-    anywhere = rng.uniform(10, [CAMERA.width - 10, CAMERA.height - 10], (150, 2))
-    for uv_px, texture, expected in ((on_edge, 0.0, False), (anywhere, 30.0, True)):
-        ids = np.arange(150, dtype=np.int32)
-        measured = Observations(np.column_stack([uv_px, np.full(150, np.nan)]), np.ones((150, 3)))
-        track = Track(estimate, ids, measured, ids)
-        grey = np.where(u > edge_px[:, None], 150, 90) + rng.normal(0, 1.5 + texture, u.shape)
-        picture = np.clip(grey, 0, 255).astype(np.uint8)
-        frame = StereoFrame(FRAMES, round(FRAMES * 1e8), picture, picture)
-        images = Images.of(frame, CAMERA)
-        assert slam.front_end.is_believable(track, images, frame.stamp_ns) == expected
+    rng, rows = np.random.default_rng(1), np.arange(25, CAMERA.height - 25, 10)
+    edge_px = np.full(CAMERA.height, 0.5 * CAMERA.width)
+    pixels = (
+        np.stack([edge_px[rows], rows], axis=1),
+        rng.uniform(12, [CAMERA.width - 12, CAMERA.height - 12], (len(rows), 2)),
+    )
+    faces = np.where(u > edge_px[:, None], 150.0, 90.0), rng.uniform(60, 160, u.shape)
+    images = [(face + rng.normal(0, 1.5, u.shape)).clip(0, 255) for face in faces]
+    return [(image.astype(np.float32), uv) for image, uv in zip(images, pixels, strict=True)]
+
+
+def seen_from(T_camera_world, image, uv_px):
+    """Return the track of points that an image shows just so from a pose (4, 4)."""
+    points = CAMERA.back_project(uv_px, np.full(len(uv_px), 2.0))
+    disparity = np.full(len(uv_px), CAMERA.disparity_times_depth / 2.0)
+    sure = Observations(np.column_stack([uv_px, disparity]), np.full((len(uv_px), 3), 0.15))
+    measured = with_patch_noise(image, sure, is_matched=True)
+    in_world = transform_points(invert(T_camera_world), points)
+    estimate = refine_pose(CAMERA, T_camera_world, in_world, measured)
+    ids = np.arange(len(uv_px), dtype=np.int32)
+    return Track(estimate, ids, measured, ids)
+
+
+@pytest.mark.parametrize('shows', ['an edge', 'a texture'])
+def test_points_that_slide_along_an_edge_do_not_outweigh_wheels(frames, monkeypatch, shows):
+    """Where wheels know the way along it better, a picture that says otherwise has no pose."""
+    slam, _ = drive(frames[:9], wheel_poses())
+    for pose in wheel_poses()[5 * 8 + 1 : 5 * 9 + 1]:
+        slam.add(pose)
+    front_end, frame = slam.front_end, frames[9]
+    image, uv_px = on_edge_and_anywhere()[shows == 'a texture']
+    slid = make_transform(np.eye(3), np.array([0.0, 0.05, 0.0]))
+    seen = seen_from(slid @ front_end.motion.predict(frame.stamp_ns), image, uv_px)
+    monkeypatch.setattr(FrontEnd, '_followed', lambda *_: seen)
+    track = front_end.track(frame, Images.of(frame, CAMERA))
+    assert (track is None) == (shows == 'an edge')
+    if track is not None:
+        assert not track.is_weak and track.prior is None
+        np.testing.assert_allclose(track.T_camera_world, seen.T_camera_world)
 
 
 def test_a_turn_without_a_picture_is_as_the_gyroscope_measures_it(frames):

@@ -20,7 +20,7 @@ from segfloor_ros.core.slam.tracking.motion import (
     joined_motion,
 )
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ
-from segfloor_ros.core.twists import se3_exp, se3_log
+from segfloor_ros.core.twists import se3_exp
 
 MOUNT = Mount(0.45, pitch_rad=0.35, roll_rad=-0.2, forward_m=0.3, left_m=-0.15, yaw_rad=0.4)
 SOMEWHERE = se3_exp(np.array([0.7, -0.4, 1.5, 0.3, -0.9, 0.2]))
