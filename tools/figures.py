@@ -36,7 +36,7 @@ from segfloor_ros.core.geometry import Array
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / 'docs' / 'figures.json'
 PAGES = (ROOT / 'README.md', ROOT / 'docs' / 'benchmarks.md')
-OUTLINES = ROOT / 'test' / 'floor'
+OUTLINES = ROOT / 'test' / 'core' / 'floor'
 TIMEOUT_S = 3600.0
 LONGEST_LAG_S = 10.0
 

@@ -107,7 +107,7 @@ SLAM: dict[str, Mechanism] = {
         {'core.slam.places.loops.PlaceMatcher.look_at_floor': _none}
     ),
     'relocalisation by several frames': Mechanism({'core.slam.places.place_recognition.PROOF': 1}),
-    'map parts': Mechanism({'core.slam.stereo_slam.LOST_NS': 1 << 62}),
+    'map parts': Mechanism({'core.slam.session.LOST_NS': 1 << 62}),
     'two motions distinguished': Mechanism(
         {
             'core.slam.tracking.pose.differ': lambda a, b: False,
@@ -126,7 +126,7 @@ SLAM: dict[str, Mechanism] = {
     'offset of the camera once it is known': Mechanism(
         {'core.plugins.sensors.wheel_odometry.KNOWN_M': np.inf}
     ),
-    'begin again': Mechanism({'core.slam.stereo_slam.HARDLY_BEGUN': -1}),
+    'begin again': Mechanism({'core.slam.session.HARDLY_BEGUN': -1}),
     'scene flow': Mechanism({'core.plugins.moving.scene_flow.SceneFlow._earlier': lambda *_: []}),
     'points seen through': Mechanism({'core.slam.sparse_map.PROOF': 1 << 30}),
     'search for what moves': Mechanism(settings={'detect_moving': False}),

@@ -32,9 +32,9 @@ from segfloor_ros.core.plugins.assembly import make_pipeline
 from segfloor_ros.core.plugins.maps.map_arrays import fill_map
 from segfloor_ros.core.plugins.maps.pruning import prune
 from segfloor_ros.core.plugins.maps.saved_pipeline import load_pipeline, save_pipeline
-from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.core.slam.rig import Rig
+from segfloor_ros.core.slam.session import SessionState
 from segfloor_ros.core.slam.sparse_map import SparseMap
 from segfloor_ros.nodes.configuration import resolve
 from tools.driving import open_recording
@@ -135,7 +135,7 @@ def drive_session(drive: Path, saved: MapFile | None, first: Path) -> tuple[MapF
             results += pipeline.process(frame)
         results += pipeline.finish_tracking()
         grid = pipeline.finish()
-        is_known = pipeline.slam.back_end.submap is not Submap.OUTSIDE
+        is_known = pipeline.slam.session.state is not SessionState.OUTSIDE
         after = save_pipeline(pipeline) if is_known or saved is None else saved
     assert grid is not None
     errors = _errors_m(results, drive, first)

@@ -77,7 +77,7 @@ class RunSummary:
     relocalisations: when tracking was lost and found again, lost_s and found_s, in seconds.
     submaps: the first_frame and last_frame of every stretch that was mapped without knowing where
     in the map it is, and whether it was `merged` later; what was not is in no map and no
-    trajectory. sensors: messages used, by name.
+    trajectory. left_out_frames: how many frames that are. sensors: messages used, by name.
     repeated_frames: tracked although the camera delivered the image before again, bit for bit.
     blind_frames: with a pose of wheels or gyroscope alone. moving_frames: in which something was
     found that moves. sensor_remarks: what seems wrong with sensors, in words. input_faults: what is
@@ -97,6 +97,7 @@ class RunSummary:
     loop_times_s: list[float]
     relocalisations: list[dict[str, float]]
     submaps: list[dict[str, int | bool]]
+    left_out_frames: int
     map_updates: int
     wall_s: float
     frames_per_s: float
@@ -114,6 +115,11 @@ class RunSummary:
     interrupted: bool
     stages: dict[str, dict[str, float]]
     rss_mb: dict[str, Any]
+
+    @property
+    def left_out(self) -> list[str]:
+        """The frames of each submap that is in no map and no trajectory, e.g. 4-9."""
+        return [_range_words(submap) for submap in self.submaps if not submap['merged']]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,6 +178,13 @@ def summarise(
     tracked = np.array([frame.tracked for frame in frames], bool)
     in_submap = np.array([frame.in_submap for frame in frames], bool)
     indices, stamps = [f.index for f in frames], [f.stamp_ns for f in frames]
+    submaps = submap_intervals(indices, in_submap, tracked)
+    left_out = [
+        submap['first_frame'] <= index <= submap['last_frame']
+        for submap in submaps
+        if not submap['merged']
+        for index in indices
+    ]
     return RunSummary(
         map=MAP if has_map else None,
         frames=len(frames),
@@ -180,7 +193,8 @@ def summarise(
         loops=len(loop_times_s),
         loop_times_s=loop_times_s,
         relocalisations=relocalisations(stamps, tracked),
-        submaps=submap_intervals(indices, in_submap, tracked),
+        submaps=submaps,
+        left_out_frames=sum(left_out),
         wall_s=round(wall_s, 3),
         frames_per_s=round(len(frames) / wall_s, 2),
         camera_height_m=round(mount.height_m, 4) if mount else None,
@@ -326,7 +340,9 @@ def _writers(result: RunResult) -> dict[str, Callable[[Path], object]]:
         of_map
         | _label_writers(result)
         | {
-            'trajectory.txt': lambda path: write_tum(path, result.trajectory),
+            'trajectory.txt': lambda path: write_tum(
+                path, result.trajectory, map(_left_out_words, result.summary.left_out)
+            ),
             'keyframes.txt': lambda path: write_tum(path, result.keyframes),
             'camera_trajectory.txt': lambda path: write_tum(path, camera),
             'labelled_cloud.ply': lambda path: write_ply(path, result.labelled),
@@ -386,6 +402,11 @@ def stage_rows(stages: Mapping[str, Mapping[str, float]]) -> list[list[str]]:
 def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
     """Return the summary as (what, value with unit) for people."""
     used = ', '.join(f'{name} ({count})' for name, count in summary.sensors.items())
+    merged = [_range_words(submap) for submap in summary.submaps if submap['merged']]
+    left_out = (
+        f'{summary.left_out_frames} ({", ".join(summary.left_out)}): mapped in submaps that were '
+        'not recognised in the map'
+    )
     # What does not apply is None.
     rows: list[tuple[str, Any]] = [
         ('sensors used (messages)', used or None),
@@ -393,7 +414,8 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ('of them on sensors alone', summary.blind_frames if used else None),
         ('frames repeated by the camera', summary.repeated_frames or None),
         ('frames lost', ', '.join(f'{a}-{b}' for a, b in summary.lost_intervals) or 'none'),
-        *(('frames in a submap', _submap_words(submap)) for submap in summary.submaps),
+        ('frames mapped in submaps that were merged', ', '.join(merged) or None),
+        ('frames left out', left_out if summary.left_out else None),
         *(('remark', remark) for remark in summary.sensor_remarks),
         *(
             ('fault of the images', f'{fault["fault"]}, {fault["value"]} {fault["unit"]}')
@@ -423,9 +445,12 @@ def _mount_rows(height_m: float | None, pitch_rad: float | None) -> list[tuple[s
     ]
 
 
-def _submap_words(submap: Mapping[str, int | bool]) -> str:
-    outcome = 'merged later' if submap['merged'] else 'no place of the map recognised, left out'
-    return f'{submap["first_frame"]}-{submap["last_frame"]}, {outcome}'
+def _range_words(submap: Mapping[str, int | bool]) -> str:
+    return f'{submap["first_frame"]}-{submap["last_frame"]}'
+
+
+def _left_out_words(frames: str) -> str:
+    return f'frames {frames} are left out: mapped in a submap that was not recognised in the map'
 
 
 def read_summary(path: Path) -> dict[str, Any]:

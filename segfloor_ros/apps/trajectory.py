@@ -7,7 +7,7 @@ beside them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -80,11 +80,11 @@ def corrected_trajectory(poses: Sequence[TrackedPose], path: KeyframePath) -> Tr
     return Trajectory(np.array(stamps, np.int64), np.array(corrected).reshape(-1, 4, 4))
 
 
-def write_tum(path: Path, trajectory: Trajectory) -> None:
+def write_tum(path: Path, trajectory: Trajectory, comments: Iterable[str] = ()) -> None:
     """Write `t x y z qx qy qz qw` lines, seconds and metres (the format of the TUM RGB-D
-    benchmark).
+    benchmark), after comments (`#`).
     """
-    lines = []
+    lines = [f'# {comment}\n' for comment in comments]
     for stamp_ns, pose in zip(trajectory.stamp_ns.tolist(), trajectory.poses, strict=True):
         seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
         values = np.concatenate([pose[:3, 3], quaternion_xyzw(pose[:3, :3])])

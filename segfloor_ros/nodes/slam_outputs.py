@@ -26,7 +26,6 @@ from segfloor_ros.core.errors import MapError, SettingsError
 from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.nodes.messages import odometry as odometry_messages
 from segfloor_ros.nodes.messages import points, poses
@@ -255,10 +254,10 @@ class SlamResults:
         """Report why no result is ready. While the mount is being measured, and by a drive that was
         broken off, the newest pose is published: it comes corrected once, when keyframes come.
         """
-        result, reporter = slam.provisional, self._node.reporter
+        result, reporter = slam.session.provisional, self._node.reporter
         if result is not None:
             self._send(result)
-        if slam.back_end.submap is Submap.LOST:
+        if slam.session.state.holds_results:
             lost = self._lost_time(stamp_ns, tracked=False)
             reporter.report(stamp_ns, Level.ERROR, MAPPING_SUBMAP, tracked=0, submap=1, **lost)
             return

@@ -1,15 +1,25 @@
 """Result folders and trajectories: round trips, and nothing half-written."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from segfloor_ros.apps.results_folder import (
+    DriveFrame,
     OutputFolder,
     lost_intervals,
     relocalisations,
     submap_intervals,
+    summarise,
 )
-from segfloor_ros.apps.trajectory import TrackedPose, Trajectory, corrected_trajectory, write_tum
+from segfloor_ros.apps.trajectory import (
+    TrackedPose,
+    Trajectory,
+    corrected_trajectory,
+    read_trajectory,
+    write_tum,
+)
 from segfloor_ros.core.contracts import KeyframePath, Mount
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import invert
@@ -42,6 +52,39 @@ def test_submaps_say_whether_they_were_merged():
         {'first_frame': 11, 'last_frame': 12, 'merged': True},
         {'first_frame': 14, 'last_frame': 15, 'merged': False},
     ]
+
+
+def test_frames_of_submaps_that_were_not_merged_are_counted_and_named():
+    """Of every second frame of a recording; one frame of the last submap was lost itself."""
+    others = dict.fromkeys(
+        (
+            'skipped_frames', 'keyframes', 'map_updates', 'sensors', 'sensor_remarks',
+            'input_faults', 'failed_frames', 'failed_keyframes', 'interrupted', 'stages', 'rss_mb',
+        ),
+        0,
+    )  # fmt: skip
+    in_submap = [False, True, True, False, True, True, True, False]
+    tracked = [True, False, True, True, False, False, False, True]
+    frames = [
+        DriveFrame(k, 10 + 2 * k, tracked[k], in_submap[k], False, False, False) for k in range(8)
+    ]
+    summary = summarise(frames, 1.0, None, False, [], **others)
+    assert summary.left_out_frames == 3 and summary.left_out == ['18-22']
+    frames = [dataclasses.replace(frame, in_submap=False) for frame in frames]
+    none = summarise(frames, 1.0, None, False, [], **others)
+    assert none.left_out_frames == 0 and none.left_out == []
+
+
+def test_comments_of_a_trajectory_are_read_by_us_and_by_evo(tmp_path):
+    file_interface = pytest.importorskip('evo.tools.file_interface')
+    stamps, path = np.array([10**18, 2 * 10**18]), tmp_path / 'trajectory.txt'
+    write_tum(path, Trajectory(stamps, np.stack([moved(0.5), moved(1.5)])), ['frames 0-2', 'b'])
+    assert path.read_text().startswith('# frames 0-2\n# b\n1000000000.000000000 0.5')
+    times_s, poses = read_trajectory(path)
+    np.testing.assert_allclose(times_s, [1e9, 2e9])
+    np.testing.assert_allclose(poses[:, 0, 3], [0.5, 1.5])
+    by_evo = file_interface.read_tum_trajectory_file(path)
+    np.testing.assert_allclose(by_evo.positions_xyz[:, 0], [0.5, 1.5])
 
 
 def test_frames_move_along_with_their_corrected_keyframe():

@@ -24,6 +24,9 @@ from segfloor_ros.core.slam.tracking.track import Track
 from segfloor_ros.core.twists import adjoint
 
 NOT_RECOGNISED = 'mapped, but no place of the map was recognised'
+NOTHING_SEEN = 'too few known points in view'
+BEFORE_RECOGNITION = ', mapped before the map was recognised'
+OUTSIDE_LOADED = ', outside the loaded map'
 
 MOST_LOOKED_BACK = 100
 """Of the frames of a camera that is looked for, so many may turn out to have seen where it was."""
@@ -61,6 +64,19 @@ def left_out(result: FrameResult) -> FrameResult:
         blind=False,
         in_submap=result.in_submap or result.tracked,
     )
+
+
+def searched(result: FrameResult) -> FrameResult:
+    """Return what is left of a frame that was searched for in a loaded map, and mapped in a submap
+    that is dropped.
+    """
+    return replace(left_out(result), in_submap=False, state=f'lost: {NOTHING_SEEN}')
+
+
+def outside(result: FrameResult) -> FrameResult:
+    """Return a frame that was not found in a loaded map, as one outside of it."""
+    state = result.state.replace(BEFORE_RECOGNITION, OUTSIDE_LOADED)
+    return replace(result, in_submap=False, outside=result.tracked, state=state)
 
 
 def turned(points: MovingPoints, T: Array) -> MovingPoints:

@@ -460,6 +460,10 @@ def test_the_larger_of_two_parts_that_were_not_joined_is_the_map(tmp_path):
     assert summary['submaps'] == [{'first_frame': first, 'last_frame': last, 'merged': False}]
     ((lost_from, lost_to),) = summary['lost_intervals']
     assert lost_from == 0 and last < lost_to < lengths[0] + 20
+    assert summary['left_out_frames'] == lengths[0]
+    assert f'{lengths[0]} ({first}-{last})' in done.stdout
+    begin, *rest = (out / 'trajectory.txt').read_text().splitlines()
+    assert begin.startswith(f'# frames {first}-{last} are left out') and '#' not in ''.join(rest)
     written = np.loadtxt(out / 'trajectory.txt')
     assert len(written) == summary['tracked_frames'] == sum(lengths) - lost_to - 1
     assert written[0, 0] == pytest.approx(frames[lost_to + 1].stamp_ns * 1e-9)

@@ -17,8 +17,8 @@ from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.plugins.maps.known_map import KnownMap, as_seen_by
 from segfloor_ros.core.plugins.maps.map_arrays import fill_map, moved
 from segfloor_ros.core.plugins.maps.saved_slam import load_slam, save_slam
-from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.rig import OffsetEstimate, Rig
+from segfloor_ros.core.slam.session import SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import SparseMap
 from segfloor_ros.core.slam.tracking.frame_to_frame import FrameToFrame
@@ -167,7 +167,7 @@ def test_a_drive_in_a_loaded_map_maps_on_its_own_at_once_and_gives_that_up_when_
     slam = loaded(mapped, localize=False)
     before, poses = len(slam.map.keyframes), there(25)[10:18]
     come = [slam.process(ROOM.frame(0, poses[0]))]
-    assert slam.back_end.submap is Submap.LOST and len(slam.map.keyframes) == 1
+    assert slam.session.state.holds_results and len(slam.map.keyframes) == 1
     come += [slam.process(ROOM.frame(k, pose)) for k, pose in enumerate(poses) if k]
     # Nothing is said before it is certain; then all frames come that saw the place.
     assert [len(batch) for batch in come] == [0, 0, 3, 1, 1, 1, 1, 1]
@@ -175,7 +175,7 @@ def test_a_drive_in_a_loaded_map_maps_on_its_own_at_once_and_gives_that_up_when_
         assert result.tracked and not result.in_submap and not result.outside
         off = invert(pose) @ result.T_map_odom @ result.T_odom_base
         assert np.linalg.norm(off[:3, 3]) < 0.02
-    assert slam.back_end.submap is Submap.KNOWN
+    assert slam.session.state is SessionState.MAPPING
     # Nobody saw these views in two lights: the map is the one that was loaded, and what is new.
     assert before <= len(slam.map.keyframes) < before + len(poses)
 
@@ -222,7 +222,7 @@ def test_a_frame_that_is_lost_is_looked_for_once(mapped, monkeypatch):
     rooms = [other, other, other, ROOM, ROOM, ROOM]
     for k, room in enumerate(rooms):
         slam.process(room.frame(5 + k, here))
-        assert (slam.back_end.submap is Submap.KNOWN) == (k == 5)
+        assert (slam.session.state is SessionState.MAPPING) == (k == 5)
     assert len(stamps) == len(set(stamps)) == len(rooms)
 
 
@@ -232,10 +232,10 @@ def test_after_a_pose_that_was_wrong_the_whole_map_is_searched_again(mapped, mon
     slam.process(other.frame(5, poses[0]))
     slam.search_near(planar_pose(30.0, 0.0, 0.0), 1.0, 0.5)
     results = [r for k in range(25) for r in slam.process(other.frame(6 + k, poses[0]))]
-    assert slam.back_end.submap is Submap.LOST
+    assert slam.session.state.holds_results
     assert not any(r.tracked for r in results)
     come = [slam.process(ROOM.frame(31 + k, pose)) for k, pose in enumerate(poses[10:18])]
-    assert come[-1][-1].tracked and slam.back_end.submap is Submap.KNOWN
+    assert come[-1][-1].tracked and slam.session.state is SessionState.MAPPING
 
 
 def test_images_that_cannot_be_tracked_are_said_while_a_loaded_map_is_searched(mapped):
@@ -248,7 +248,7 @@ def test_images_that_cannot_be_tracked_are_said_while_a_loaded_map_is_searched(m
     assert len(results) == 6 and not any(r.tracked or r.in_submap for r in results)
     assert all('without contrast' in r.state for r in results[-3:])
     come = [slam.process(ROOM.frame(11 + k, pose)) for k, pose in enumerate(poses[10:18])]
-    assert come[-1][-1].tracked and slam.back_end.submap is Submap.KNOWN
+    assert come[-1][-1].tracked and slam.session.state is SessionState.MAPPING
 
 
 def test_another_room_is_not_this_one(mapped):

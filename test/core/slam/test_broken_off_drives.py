@@ -20,9 +20,8 @@ from segfloor_ros.core.plugins.maps.saved_slam import (
     load_slam,
     save_slam,
 )
-from segfloor_ros.core.slam.mapping.back_end import Submap
+from segfloor_ros.core.slam.session import HARDLY_BEGUN
 from segfloor_ros.core.slam.settings import StereoSlamSettings
-from segfloor_ros.core.slam.stereo_slam import HARDLY_BEGUN
 
 SETTINGS = StereoSlamSettings(num_features=600)
 ROOM, OTHER = StereoRoom(), StereoRoom(seed=77)
@@ -112,8 +111,8 @@ def test_a_heading_that_is_unsure_makes_the_way_since_unsure_across_it(frames):
         arc.append(pose)
     for k, pose in enumerate(arc):
         slam.process(ROOM.frame(FRAMES + GAP + k, pose))
-    assert slam.back_end.submap is Submap.LOST
-    result = slam.provisional
+    assert slam.session.state.holds_results
+    result = slam.session.provisional
     # From where the camera was held to where the base is now.
     held = base_at(FRAMES - 1) @ MOUNT.T_base_left
     way = (result.T_map_odom @ result.T_odom_base)[:3, 3] - held[:3, 3]
@@ -150,7 +149,7 @@ def test_what_is_mapped_elsewhere_merges_when_the_map_is_recognised(frames):
     for k, pose in enumerate(poses):
         found = slam.process(ROOM.frame(FRAMES + GAP + k, pose))
         results.append(found)
-        published.append(found[-1] if found else slam.provisional)
+        published.append(found[-1] if found else slam.session.provisional)
         assert np.isin(known, slam.to_arrays()['keyframe_stamp_ns']).all()
     assert sum(result == [] for result in results) > 20
     assert results[-1] != []
@@ -175,7 +174,7 @@ def test_the_farther_from_where_a_submap_began_the_less_is_known_of_the_place(fr
     for k in range(36):
         pose = planar_pose(0.04 * FRAMES, -0.05 * k, 0.01 * FRAMES + 2.2)
         if not slam.process(ROOM.frame(FRAMES + GAP + k, pose)):
-            mapped.append(slam.provisional)
+            mapped.append(slam.session.provisional)
     began, end = mapped[0], mapped[-1]
     way_m = np.linalg.norm((invert(began.T_odom_base) @ end.T_odom_base)[:3, 3])
     assert way_m > 0.7
@@ -190,7 +189,7 @@ def test_a_map_that_had_hardly_begun_stays(frames):
     assert len(known) < HARDLY_BEGUN
     for k in range(10, 40):
         slam.process(OTHER.frame(k, base_at(k)))
-    assert slam.back_end.submap is Submap.LOST
+    assert slam.session.state.holds_results
     np.testing.assert_array_equal(slam.to_arrays()['keyframe_stamp_ns'], known)
 
 

@@ -8,8 +8,8 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.contracts import Mount, StereoFrame
 from segfloor_ros.core.plugins.maps.known_map import SubmapKeeper
-from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.optional import NoSensors, NothingMoves, Plugins
+from segfloor_ros.core.slam.session import SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.twists import se3_exp
@@ -88,12 +88,12 @@ def test_a_loaded_map_is_another_world_than_what_is_mapped_beside_it(rooms) -> N
     slam.front_end.motion.T_world_odom = se3_exp(np.array([0.2, -0.3, 0.1, 0.4, -0.3, 0.9]))
     resets.clear()
     slam.process(other.frame(0, planar_pose(0.0, 0.0, 1.0)))
-    assert slam.back_end.is_beside_loaded
+    assert slam.session.state is SessionState.BESIDE
     assert (resets['moving'], resets['meter'], resets['world']) == (1, 1, 1)
     np.testing.assert_array_equal(slam.front_end.motion.T_world_odom, np.eye(4))
     resets.clear()
     slam.process(StereoFrame(1, 10**8, GREY, GREY))
-    assert slam.back_end.submap is not Submap.LOST
-    assert not slam.back_end.is_beside_loaded
+    assert not slam.session.state.holds_results
+    assert slam.session.state is SessionState.LOADED
     assert (resets['moving'], resets['meter'], resets['world']) == (1, 1, 1)
     assert slam.front_end.motion.state.is_lost

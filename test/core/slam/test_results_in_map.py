@@ -79,7 +79,7 @@ def test_a_pose_is_as_unsure_as_where_its_map_began_and_the_way_since() -> None:
     of_start, of_way = uneven_covariance(RNG, 4.0), uneven_covariance(RNG)
     slam = equipped_slam(CAMERA, StereoSlamSettings(), MOUNT)
     slam.front_end.motion.take(T_CAMERA_WORLD, of_way, 0)
-    slam._began_unsure = began, of_start
+    slam.session.unsure_start = began, of_start
     last = slam.last_pose
     assert last is not None
     way = drawn_poses(RNG, T_CAMERA_WORLD @ invert(began), of_way)

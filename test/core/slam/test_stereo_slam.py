@@ -115,7 +115,7 @@ def test_pose_and_images_of_a_keyframe_are_announced_before_the_map_takes_it_in(
     """Before its features are measured; late where an adjustment has still to move the map."""
     slam = equipped_slam(CAMERA, SETTINGS, MOUNT, background=True)
     announced, observed = {}, []
-    observe, take_adjustment = slam.front_end.observe, slam._take_adjustment
+    observe, collect = slam.front_end.observe, slam.back_end.collect
 
     def announce(result, frame, moving):
         assert slam.map.keyframes[-1].stamp_ns < result.stamp_ns  # not yet in the map
@@ -133,9 +133,9 @@ def test_pose_and_images_of_a_keyframe_are_announced_before_the_map_takes_it_in(
 
     slam.announce, slam.front_end.observe = announce, note_observed
     if is_late:
-        slam._take_adjustment = lambda wait: take_adjustment(wait) if wait else None
+        slam.back_end.collect = lambda wait: collect(wait) if wait else None
     else:
-        slam._take_adjustment = lambda wait: take_adjustment(wait=True)
+        slam.back_end.collect = lambda wait: collect(wait=True)
     results = []
     for frame in frames:
         observed.clear()
@@ -157,8 +157,8 @@ def test_pose_and_images_of_a_keyframe_are_announced_before_the_map_takes_it_in(
 def test_a_keyframe_is_announced_late_while_the_whole_map_may_move(frames):
     """And after a frame that did not become one: nobody waits for more than one in vain."""
     slam = equipped_slam(CAMERA, SETTINGS, MOUNT, background=True)
-    take_adjustment, observe = slam._take_adjustment, slam.front_end.observe
-    slam._take_adjustment = lambda wait: take_adjustment(wait=True)
+    collect, observe = slam.back_end.collect, slam.front_end.observe
+    slam.back_end.collect = lambda wait: collect(wait=True)
     observed, early, is_blank = [], [], [False]
 
     def note_observed(frame, images, track):

@@ -54,10 +54,9 @@ from segfloor_ros.core.floor.plane.plane import (
     PlaneFit,
     Samples,
     angles_height_of,
+    mean_climb,
     plane_of,
     plausible,
-    preference,
-    propose,
     refine,
     scores,
     shares,
@@ -512,3 +511,33 @@ def _below(blank: NDArray[np.float32]) -> NDArray[np.bool_]:
     below = np.zeros(blank.shape, np.bool_)
     below[:-_BLANK_GAP] = mean[_BLANK_GAP:] > 0.95
     return below
+
+
+def propose(samples: Samples, count: int, rng: np.random.Generator, known: Array) -> Array:
+    """Return plausible pitch, roll and height (M, 3) of planes through few samples each.
+
+    Half of them go through three samples, half through two, without roll. known: (3,), values
+    that are given, NaN where not.
+    """
+    probability = samples.weight / samples.weight.sum()
+    chosen = rng.choice(len(samples.weight), size=(count, 3), p=probability)
+    q = samples.rays[chosen]
+    inverse_depth = samples.disparity_px[chosen] / samples.disparity_m
+    rows = q.copy()
+    half = count // 2
+    rows[half:, 2] = (1.0, 0.0, 0.0)
+    inverse_depth[half:, 2] = 0.0
+    regular = np.abs(np.linalg.det(rows)) > 1e-6
+    planes = np.linalg.solve(rows[regular], -inverse_depth[regular][..., None])[..., 0]
+    planes = planes[np.isfinite(planes).all(axis=1) & (np.abs(planes).max(axis=1) > 1e-6)]
+    guesses = np.where(np.isnan(known), angles_height_of(planes), known)
+    return guesses[plausible(guesses)]
+
+
+def preference(angles_height: Array, travel: Array, mean: Array, sigma: Array) -> Array:
+    """Return how far each plane (M, 3) is what one expects, in (0, 1]: pitch, roll and height (3,)
+    with their standard deviations, and a camera that travels (T, 3), in metres, parallel to it.
+    """
+    squares = (((angles_height - mean) / sigma) ** 2).sum(axis=1)
+    squares += mean_climb(angles_height, travel) ** 2
+    return np.exp(-0.5 * squares)

@@ -212,27 +212,6 @@ def plausible(angles_height: Array) -> NDArray[np.bool_]:
     return level & (height > HEIGHT_RANGE_M[0]) & (height < HEIGHT_RANGE_M[1])
 
 
-def propose(samples: Samples, count: int, rng: np.random.Generator, known: Array) -> Array:
-    """Return plausible pitch, roll and height (M, 3) of planes through few samples each.
-
-    Half of them go through three samples, half through two, without roll. known: (3,), values
-    that are given, NaN where not.
-    """
-    probability = samples.weight / samples.weight.sum()
-    chosen = rng.choice(len(samples.weight), size=(count, 3), p=probability)
-    q = samples.rays[chosen]
-    inverse_depth = samples.disparity_px[chosen] / samples.disparity_m
-    rows = q.copy()
-    half = count // 2
-    rows[half:, 2] = (1.0, 0.0, 0.0)
-    inverse_depth[half:, 2] = 0.0
-    regular = np.abs(np.linalg.det(rows)) > 1e-6
-    planes = np.linalg.solve(rows[regular], -inverse_depth[regular][..., None])[..., 0]
-    planes = planes[np.isfinite(planes).all(axis=1) & (np.abs(planes).max(axis=1) > 1e-6)]
-    guesses = np.where(np.isnan(known), angles_height_of(planes), known)
-    return guesses[plausible(guesses)]
-
-
 def _seen(samples: Samples, planes: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return of each sample and each plane m (M, 3) by how much its disparity exceeds the plane's,
     how much less than that lies clearly below the plane, and whether it is visible there at all,
@@ -281,15 +260,6 @@ def shares(samples: Samples, angles_height: Array) -> tuple[float, float]:
         return 0.0, 1.0
     on, below = weight[np.abs(error) < SAME_PX].sum(), weight[error < limit].sum()
     return float(on) / total, float(below) / total
-
-
-def preference(angles_height: Array, travel: Array, mean: Array, sigma: Array) -> Array:
-    """Return how far each plane (M, 3) is what one expects, in (0, 1]: pitch, roll and height (3,)
-    with their standard deviations, and a camera that travels (T, 3), in metres, parallel to it.
-    """
-    squares = (((angles_height - mean) / sigma) ** 2).sum(axis=1)
-    squares += mean_climb(angles_height, travel) ** 2
-    return np.exp(-0.5 * squares)
 
 
 def mean_climb(angles_height: Array, travel: Array) -> Array:

@@ -9,6 +9,7 @@ second are looked for in the first by what they observed, one after the other.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,12 +31,13 @@ from segfloor_ros.core.slam.places.loop_closing import (
 )
 from segfloor_ros.core.slam.places.loops import LoopDetector, PlaceMatcher, drift
 from segfloor_ros.core.slam.places.place_recognition import (
-    FloorIndex,
+    PlaceIndex,
     PlaceRecognition,
     Relocaliser,
+    Vocabulary,
 )
 from segfloor_ros.core.slam.rig import OffsetEstimate, Rig
-from segfloor_ros.core.slam.sparse_map import KeyframeRecord, Match, SparseMap
+from segfloor_ros.core.slam.sparse_map import GroundView, KeyframeRecord, Match, SparseMap
 from segfloor_ros.core.slam.thresholds import PROOF
 from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.map_tracking import Pixels
@@ -207,3 +209,18 @@ class SubmapKeeper:
     def hold(self, own: SparseMap, places: PlaceRecognition, of_drive: bool) -> KnownMap:
         """Return the present map as a known one, beside which `own` may begin anew."""
         return KnownMap(own, map_to_arrays(own) | places.to_arrays(), of_drive)
+
+
+class FloorIndex:
+    """Keyframes of a map by the look of their floor."""
+
+    def __init__(self, keyframes: Sequence[KeyframeRecord]) -> None:
+        self._vocabulary, self._index = Vocabulary.load(), PlaceIndex()
+        for keyframe in keyframes:
+            self._index.add(keyframe.index, self._vocabulary.words(keyframe.ground.descriptor))
+
+    def like(self, ground: GroundView) -> NDArray[np.intp]:
+        """Return the keyframes, by index, whose floor looks like a view of it, most alike first."""
+        score = self._index.score(self._vocabulary.words(ground.descriptor), len(self._index))
+        best = np.argsort(-score, kind='stable')
+        return best[score[best] > 0]

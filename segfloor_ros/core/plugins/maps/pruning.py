@@ -16,9 +16,10 @@ from segfloor_ros.core.grid.keyframe_evidence import LENGTHS
 from segfloor_ros.core.plugins.maps.saved_slam import PART as SLAM
 from segfloor_ros.core.plugins.maps.saved_slam import parts_that_fit
 from segfloor_ros.core.plugins.semantics.label_map import LABELS, SEEN_LENGTHS
-from segfloor_ros.core.slam.places.views import views_to_keep
+from segfloor_ros.core.slam.places.views import NEW_MOTION_RATIO, SECOND_VISIT, novelty
 from segfloor_ros.core.slam.rig import MIN_DEPTH_M
 from segfloor_ros.core.slam.sparse_map import OF_KEYFRAMES
+from segfloor_ros.core.slam.thresholds import MAJORITY, PROOF
 
 OF_KEYFRAME = 'keyframe_', 'feature_', 'corner_', 'word'
 """How the names of arrays begin that hold something for each keyframe."""
@@ -116,3 +117,49 @@ def prune_file(path: Path) -> str:
     write_map_file(path, pruned)
     before, after = (len(file.parts[SLAM]['keyframe_stamp_ns']) for file in (saved, pruned))
     return f'{path}, {before} keyframes before, {after} now'
+
+
+def views_to_keep(
+    T_camera_world: Array,
+    depth_m: Array,
+    may_stand_in: NDArray[np.bool_],
+    shared: sparse.csr_array | None = None,
+) -> NDArray[np.intp]:
+    """Return for each view (K, 4, 4) of a map, the oldest first, which sees things at about depth_m
+    (K,), the view that stands for it: itself, or where a later visit shows the same, the nearest
+    of that visit that may (K,). Views then grow with the area, not with the visits. The first one
+    stays, since it holds the map.
+
+    shared: the share (K, K) of the points of one view that another observes. With it a later visit
+    shows the same where it observes most of them, so in the same light. Of others the views of
+    `PROOF` visits stay: those go first of which a later one observes most.
+    """
+    number, centres = np.arange(len(depth_m)), invert(T_camera_world)[:, :3, 3]
+    reach_m = SECOND_VISIT * NEW_MOTION_RATIO * depth_m
+    around, alike, likest = [], [], np.zeros(len(number))
+    for k in number:
+        near = np.flatnonzero(np.linalg.norm(centres - centres[k], axis=1) < reach_m[k])
+        new = novelty(T_camera_world[near] @ invert(T_camera_world[k]), float(depth_m[k]))
+        near, new = near[new < SECOND_VISIT], new[new < SECOND_VISIT]
+        # The views of one visit follow each other.
+        visit = np.cumsum(np.diff(near, prepend=0) > 1)
+        later = visit > visit[near == k]
+        around.append((near, new, visit, later))
+        share = np.ones(len(near)) if shared is None else shared[[k]].toarray()[0, near]
+        alike.append(share >= MAJORITY)
+        likest[k] = share[later].max(initial=0.0)
+    visits, order = (
+        (1, number[:0:-1])
+        if shared is None
+        else (PROOF, 1 + np.argsort(-likest[1:], kind='stable'))
+    )
+    stands_in = number.copy()
+    for k in order.tolist():
+        near, new, visit, later = around[k]
+        stays = (may_stand_in[near] & (stands_in[near] == near)) | (near == k)
+        later = later & stays
+        if len(np.unique(visit[stays])) <= visits:
+            later &= alike[k]
+        if later.any():
+            stands_in[stands_in == k] = near[later][new[later].argmin()]
+    return stands_in

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from enum import Enum, auto
 from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from segfloor_ros.core.contracts import Up
 from segfloor_ros.core.files.arrays import Arrays
@@ -36,7 +36,7 @@ from segfloor_ros.core.slam.rig import OffsetEstimate
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
-from segfloor_ros.core.slam.tracking.images import Features, Images
+from segfloor_ros.core.slam.tracking.images import Images
 from segfloor_ros.core.slam.tracking.track import Track
 from segfloor_ros.core.timing import timed
 
@@ -45,33 +45,12 @@ GROWN = 1.25
 it was last: that costs a long drive no more than a few adjustments of all it has mapped."""
 
 
-class Submap(Enum):
-    """Which part of the map the camera is in, and is mapped.
-
-    KNOWN: the map of the drive, or a loaded one that it was recognised in. LOADED: a loaded one
-    that it is not yet recognised in. The others are submaps beside a known map, until that is
-    recognised. LOST: results are held back; the camera got lost, or a map was loaded and is still
-    searched. OUTSIDE: a loaded map was searched in vain, and results come.
-    """
-
-    KNOWN = auto()
-    LOADED = auto()
-    OUTSIDE = auto()
-    LOST = auto()
-
-    @property
-    def is_beside(self) -> bool:
-        """Whether it is a submap beside the known map."""
-        return self in (Submap.OUTSIDE, Submap.LOST)
-
-
 class BackEnd:
     """Adjusts the neighbourhood of every keyframe, closes loops, and adjusts the whole map after a
     loop that moves it far or once it has grown.
 
     background: on threads beside tracking; else at once, so that the outcome does not depend on
     timing. Tracking never waits for an adjustment of the whole map. keeper: of maps as arrays.
-    submap: what the map is.
     """
 
     def __init__(
@@ -88,8 +67,6 @@ class BackEnd:
         self.mapper = LocalMapper(sparse_map)
         self.places = front_end.places
         self.loop_count = 0
-        self.submap = Submap.KNOWN
-        self._known: KnownMap | None = None
         self._map = sparse_map
         self._rig = sparse_map.rig
         self.loops = LoopDetector(sparse_map, self.places)
@@ -104,12 +81,6 @@ class BackEnd:
     def idle(self) -> bool:
         """Whether nothing is being solved that a new keyframe would have to wait for."""
         return self._local.idle
-
-    @property
-    def is_beside_loaded(self) -> bool:
-        """Whether it maps a submap while the camera is still looked for in a loaded map."""
-        known = self._known
-        return self.submap is Submap.LOST and known is not None and not known.of_drive
 
     def holds_one(self, of_all: bool = False) -> bool:
         """Whether there is an adjustment of a neighbourhood that is not in the map yet; of_all: or
@@ -130,65 +101,48 @@ class BackEnd:
         since_ns = stamp_ns - front_end.keyframe_ns
         return front_end.local.wants_keyframe(track, frames_since, since_ns, self.idle)
 
-    def take_in(self, keyframe: KeyframeRecord, images: Images, up_world: Up | None) -> bool:
+    def add(self, keyframe: KeyframeRecord, patches: NDArray[np.uint8]) -> None:
+        """Add a keyframe to the map and to its places. patches: of its features."""
+        self.mapper.insert(keyframe, patches)
+        self.places.add(keyframe)
+
+    def take_in(self, keyframe: KeyframeRecord, images: Images, up_world: Up | None) -> None:
         """Adjust the map to a new keyframe: close a loop where it sees a place again, and fit its
-        neighbourhood. up_world: as an accelerometer has it. Returns whether the map has changed
-        already.
+        neighbourhood. up_world: as an accelerometer has it.
         """
         self._up_world = up_world
-        self.places.add(keyframe)
-        if self._merge(keyframe, images):
-            return True
+        self._follow(partial(self._adjust_to, keyframe, images))
+
+    def _adjust_to(self, keyframe: KeyframeRecord, images: Images) -> bool:
+        """Returns whether the map has changed already."""
         closed = self._close_loop(keyframe, images)
         if self._background:
             if not closed:
                 self._adjust(keyframe)
             return False
-        closed = closed and self.collect(wait=True)
+        closed = closed and self._collect(wait=True)
         self._adjust(keyframe)
-        return self.collect(wait=True) or closed
-
-    def start_submap(self) -> None:
-        """Go on with an empty map, until the known one, which is all there is so far, is
-        recognised.
-        """
-        of_drive = self.submap is Submap.KNOWN
-        self._known = self.keeper.hold(self._map, self.places, of_drive)
-        self.reset()
-        self.submap = Submap.LOST
+        return self._collect(wait=True) or closed
 
     def reset(self) -> None:
-        """Go on with an empty map; no id is given twice."""
+        """Begin an empty map; no id is given twice."""
         self._map.reset(self._map.points.num_ever)
         self._reset_places()
 
-    def find_in_known(
-        self, images: Images, features: Features, stamp_ns: int
-    ) -> tuple[Track | None, dict[int, Track]]:
-        """Return a frame with its pose in the known map, once several in a row were found there,
-        and those, by stamp.
-        """
-        assert self._known is not None
-        return self._known.find(images, features, stamp_ns)
+    def merge(self, known: KnownMap) -> None:
+        """Merge the map into a known one in which its latest keyframe was recognised."""
 
-    def drop_submap(self) -> None:
-        """Go back to the known map; what was mapped beside it is lost."""
-        assert self._known is not None
-        known, self._known = self._known, None
-        self.submap = Submap.KNOWN if known.of_drive else Submap.LOADED
+        def merge() -> bool:
+            self._reset_places(known.merge(self.places.to_arrays()))
+            return True
+
+        self._follow(merge)
+
+    def restore(self, known: KnownMap) -> None:
+        """Replace the map by a known one."""
         arrays = known.to_arrays()
         known.restore(arrays)
         self._reset_places(arrays)
-
-    def keep_submap(self) -> bool:
-        """Give the known map up, where the drive made it and the submap has more keyframes. Returns
-        whether it did.
-        """
-        known = self._known
-        if known is None or not known.of_drive or len(self._map.keyframes) <= known.num_keyframes:
-            return False
-        self._known, self.submap = None, Submap.KNOWN
-        return True
 
     def _reset_places(self, words: Arrays | None = None) -> None:
         self._global.reset()
@@ -198,19 +152,23 @@ class BackEnd:
         if words is not None:
             self.places.from_arrays(words)
 
-    def _merge(self, keyframe: KeyframeRecord, images: Images) -> bool:
-        """Merge the submap into the known map, where that is recognised."""
-        known = self._known
-        if known is None or not known.recognise(keyframe, images):
-            return False
-        self._reset_places(known.merge(self.places.to_arrays()))
-        self._known, self.submap = None, Submap.KNOWN
-        return True
-
-    def collect(self, wait: bool) -> bool:
-        """Bring what is solved into the map; with `wait` a running adjustment of a neighbourhood is
-        waited for. Returns whether there was anything.
+    def _follow(self, change: Callable[[], bool]) -> None:
+        """Let the camera, and with it `odom`, move along with the latest keyframe. change: of the
+        map; returns whether there was any.
         """
+        before = self._map.keyframes[-1].T_camera_world
+        if change():
+            self._front_end.follow_map(before, self._map.keyframes[-1].T_camera_world)
+
+    def collect(self, wait: bool) -> None:
+        """Bring what is solved into the map; with `wait` a running adjustment of a neighbourhood is
+        waited for.
+        """
+        if self._map.keyframes:
+            self._follow(partial(self._collect, wait))
+
+    def _collect(self, wait: bool) -> bool:
+        """Returns whether there was anything."""
         finished = [self._local.collect(wait)]
         if finished[0] is not None:
             finished[0]()
@@ -220,14 +178,12 @@ class BackEnd:
                 finished[1]()
         return any(apply is not None for apply in finished)
 
-    def to_arrays(self) -> Arrays:
-        """Return the map and what belongs to it, for a file: of a camera that got lost the map
-        that it was lost in.
-        """
+    def to_arrays(self, known: KnownMap | None) -> Arrays:
+        """Return the map and what belongs to it, for a file. known: another map to return."""
         offset = self._rig.offset.estimate
         measured: Arrays = {'disparity_offset': np.array([offset.value_px, offset.information])}
-        if self.submap is Submap.LOST and self._known is not None:
-            return self._known.to_arrays() | measured
+        if known is not None:
+            return known.to_arrays() | measured
         return self.keeper.to_arrays(self._map) | self.places.to_arrays() | measured
 
     def from_arrays(self, arrays: Arrays) -> None:

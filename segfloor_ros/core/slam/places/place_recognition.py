@@ -32,7 +32,7 @@ from segfloor_ros.core.files.arrays import Arrays, joined, split
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.places.views import COLUMNS, ROWS
 from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES
-from segfloor_ros.core.slam.sparse_map import GroundView, KeyframeRecord, SparseMap, features_of
+from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap, features_of
 from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, ENOUGH, MOST, PROOF, SAME
 from segfloor_ros.core.slam.tracking.images import Features, hamming
 from segfloor_ros.core.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels, Tracker
@@ -291,21 +291,6 @@ class Vocabulary:
             distance = hamming(descriptor[:, None], children[node])
             node = node * BRANCHES + distance.argmin(axis=1)
         return node.astype(np.int32)
-
-
-class FloorIndex:
-    """Keyframes of a map by the look of their floor."""
-
-    def __init__(self, keyframes: Sequence[KeyframeRecord]) -> None:
-        self._vocabulary, self._index = Vocabulary.load(), PlaceIndex()
-        for keyframe in keyframes:
-            self._index.add(keyframe.index, self._vocabulary.words(keyframe.ground.descriptor))
-
-    def like(self, ground: GroundView) -> NDArray[np.intp]:
-        """Return the keyframes, by index, whose floor looks like a view of it, most alike first."""
-        score = self._index.score(self._vocabulary.words(ground.descriptor), len(self._index))
-        best = np.argsort(-score, kind='stable')
-        return best[score[best] > 0]
 
 
 def greatest_speed_mps(keyframes: Sequence[KeyframeRecord]) -> float:

@@ -10,6 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import StereoFrame
@@ -24,7 +25,7 @@ from segfloor_ros.core.slam.tracking.images import (
     match_unguided,
 )
 from segfloor_ros.core.slam.tracking.patch_alignment import guess_disparity, measure_disparity
-from segfloor_ros.core.slam.tracking.pose import ANYWHERE, PoseEstimate, refine_pose, solve_pnp
+from segfloor_ros.core.slam.tracking.pose import PoseEstimate, Searched, refine_pose, solve_pnp
 from segfloor_ros.core.timing import timed
 from segfloor_ros.core.twists import adjoint, without_drift
 
@@ -69,15 +70,18 @@ class FrameToFrame:
         rows, new_rows = match_unguided(old.descriptor, new.descriptor, max_hamming=256)
         points, found = self._points(before, before_images, old.take(rows))
         uv_px = new.uv_px[new_rows[found]].astype(np.float64)
+        rows = distinct(uv_px)
+        points, uv_px = points[rows], uv_px[rows]
         start = solve_pnp(self._camera, points, uv_px, ITERATIONS)
         if start is None:
             return None
         uvd = np.column_stack([uv_px, np.full(len(uv_px), np.nan)])
         observations = Observations(uvd, np.full(uvd.shape, SIGMA_FLOW_PX))
-        moved = refine_pose(self._camera, start[0], points, observations, first=start[1])
-        # Far away all points are in one place, where many a corner is.
-        near = PoseEstimate(np.eye(4), moved.inliers, ANYWHERE, 1.0)
-        if not is_proof(moved.evidence(near)):
+        searched = Searched(crowded_area_px2(uv_px, self._camera.width * self._camera.height))
+        moved = refine_pose(
+            self._camera, start[0], points, observations, searched=searched, first=start[1]
+        )
+        if not is_proof(moved.evidence()):
             return None
         A = adjoint(moved.T_camera_world)
         return replace(
@@ -120,5 +124,28 @@ class FrameToFrame:
         depth = self._camera.disparity_times_depth / seen.uvd_px[found, 2]
         return self._camera.back_project(seen.uvd_px[found, :2], depth), found
 
+
+def distinct(uv_px: Array) -> NDArray[np.intp]:
+    """Return one row (M,) of pixels (N, 2) for each cell of twice the noise: a corner that is found
+    at several levels of the pyramid counts once.
+    """
+    cells = np.floor(uv_px / (2 * SAME_PX)).astype(np.intp)
+    return np.sort(np.unique(cells, axis=0, return_index=True)[1])
+
+
+def crowded_area_px2(uv_px: Array, whole_px2: float) -> float:
+    """Return the area in which pixels (N, 2) that were spread evenly would lie as close together:
+    where features crowd, wrong matches agree more often.
+    """
+    count = len(uv_px)
+    if count < 2:
+        return whole_px2
+    pairs = len(cKDTree(uv_px).query_pairs(NEAR_PX, output_type='ndarray'))
+    near = max(2 * pairs / (count * (count - 1)), 1e-9)
+    return min(whole_px2, np.pi * NEAR_PX**2 / near)
+
+
+NEAR_PX = 4 * SAME_PX
+"""Within which features count as close together."""
 
 NO_DESCRIPTOR = np.zeros((0, 32), np.uint8)

@@ -38,14 +38,9 @@ from segfloor_ros.core.slam.tracking.map_tracking import (
     Start,
     Tracker,
 )
-from segfloor_ros.core.slam.tracking.motion import (
-    CameraMotion,
-    ImageRotation,
-    TrackingState,
-    sigma_m,
-)
-from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE, with_patch_noise
-from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ, knows_more, refine_pose
+from segfloor_ros.core.slam.tracking.motion import CameraMotion, TrackingState, sigma_m
+from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE
+from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ, refine_pose
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
 
@@ -75,7 +70,6 @@ class FrontEnd:
         self._map = sparse_map
         self.relocaliser = Relocaliser(sparse_map, self.places)
         self.repeats = RepeatCheck()
-        self._rotation = ImageRotation(self._camera)
 
     @property
     def is_searching(self) -> bool:
@@ -140,7 +134,6 @@ class FrontEnd:
         """Find the pose of a frame: from the one before, else by its features. found: where
         it is in this map, as that was found while the camera was in a submap.
         """
-        self._rotation.see(images.small)
         expected = self.motion.expected(frame.stamp_ns)
         if found is not None:
             features = self.extractor.extract(frame.left, images.excluded)
@@ -150,14 +143,14 @@ class FrontEnd:
         if track is not None and not self.motion.is_plausible(track.T_camera_world, frame.stamp_ns):
             track = None
         prior = self.motion.prior(frame.stamp_ns)
-        knows_less = track is not None and self._knows_less(track, expected, frame.stamp_ns)
-        # Images that know less than the sensors, and contradict them, show something else.
-        if track is None or (knows_less and not (track.fits(expected) and track.fits(prior))):
+        knows_less = track is not None and self.motion.knows_more(track.estimate, frame.stamp_ns)
+        # Of images that know less than the sensors: errors of the same points do not average out.
+        if track is None or (knows_less and (prior is not None or not track.fits(expected))):
             self.follower.reset()
             return None
         track = replace(track, sigma_m=sigma_m(track.covariance))
         T_seen = None if knows_less else track.T_camera_world
-        track = self._weighed(replace(track, prior=prior, is_weak=knows_less))
+        track = self._weighed(replace(track, prior=prior))
         self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
         self.follower.see(images, track.point_ids, track.uv_px)
         self.frame_to_frame.see(frame, images, track.estimate)
@@ -168,15 +161,6 @@ class FrontEnd:
             self._map.points.note_tracking(track.visible_ids, track.point_ids)
         self.frames_since_keyframe += 1
         return track
-
-    def _knows_less(self, track: Track, expected: PoseEstimate | None, stamp_ns: int) -> bool:
-        """Whether sensors know some direction of the motion since the last pose better than the
-        images.
-        """
-        measured = None if self.motion.state.is_lost else self.motion.measured(stamp_ns)
-        if expected is None or measured is None:
-            return False
-        return knows_more(measured.covariance, track.estimate)
 
     def _followed(
         self, frame: StereoFrame, images: Images, expected: PoseEstimate | None
@@ -195,9 +179,29 @@ class FrontEnd:
         starts = self._starts(frame, images, features, followed, reach_px)
         found = self.tracker.best(images, features, self.local.point_ids, starts, expected)
         found = followed if found is None else found
+        if found is not None and expected is not None and reach_px < WIDE_PX:
+            found = self._standing(images, features, found, expected)
         if found is None and self.motion.state is not TrackingState.TRACKING:
             found = self._relocalise(images, features, frame.stamp_ns)
         return self._stepped(frame, images) if found is None else found
+
+    def _standing(
+        self, images: Images, features: Features, found: Track, expected: PoseEstimate
+    ) -> Track:
+        """Return, of a pose that was found and one near where it was expected, the likelier by the
+        records of their points of standing still: what comes close and fills the image has the most
+        points.
+        """
+        pose, around = expected.T_camera_world, self.local.point_ids
+        steady = self.tracker.track_at(images, features, around, pose)
+        if steady is None:
+            return found
+        of_steady, of_found = (
+            self.tracker.consensus.record(t.point_ids, t.T_camera_world).sum()
+            - t.estimate.surprise(expected)
+            for t in (steady, found)
+        )
+        return steady if of_steady > of_found else found
 
     def _starts(
         self,
@@ -210,7 +214,10 @@ class FrontEnd:
         """Yield where the camera may be, what costs least first. reach_px: up to which points may
         be elsewhere than expected.
         """
-        predictions = self._predict_poses(frame)
+        measured = self.motion.measured_pose(frame.stamp_ns)
+        predictions = [self.motion.steady(frame.stamp_ns)]
+        if measured is not None:
+            predictions.insert(0, measured)
         if reach_px < WIDE_PX:
             yield Start(predictions[0], max(reach_px, USUAL_PX), is_sure=True)
         if followed is not None:
@@ -249,13 +256,6 @@ class FrontEnd:
             self.frames_since_keyframe += 1
         elif not fault or self.motion.state is not TrackingState.TRACKING:
             self.motion.lose(frame.stamp_ns)
-
-    def _predict_poses(self, frame: StereoFrame) -> list[Array]:
-        """Return where the camera may be now, T_camera_world (4, 4) each, the likeliest first."""
-        turned = self._rotation.turn_since_last() @ self.motion.T_camera_world
-        steady = self.motion.steady(frame.stamp_ns)
-        measured = self.motion.measured_pose(frame.stamp_ns)
-        return [steady, turned] if measured is None else [measured, steady, turned]
 
     def _relocalise(
         self, images: Images, features: Features, stamp_ns: int, found: Track | None = None
@@ -300,8 +300,7 @@ class FrontEnd:
         """
         if track is not None and track.observed is not None:
             inside = is_inside(images.excluded, track.observed.features.uv_px)
-            observed = track.observed.take(np.flatnonzero(~inside))
-            return _by_patches(images, observed) if track.is_weak else observed
+            return track.observed.take(np.flatnonzero(~inside))
         features = self.extractor.extract(frame.left, images.excluded)
         if track is None or len(track.point_ids) == 0:
             if not self._map.keyframes:
@@ -317,10 +316,9 @@ class FrontEnd:
             return None
         assert matched.observed is not None
         weighed = self._weighed(replace(matched, prior=track.prior))
-        if not (track.is_weak and track.prior is not None and weighed.prior is None):
-            self.motion.T_camera_world = weighed.T_camera_world
+        self.motion.T_camera_world = weighed.T_camera_world
         self._map.points.note_tracking(matched.visible_ids, matched.point_ids)
-        return _by_patches(images, matched.observed) if track.is_weak else matched.observed
+        return matched.observed
 
     def continue_from(self, images: Images, keyframe: KeyframeRecord) -> None:
         """Track on from the points of a keyframe, old and new."""
@@ -339,13 +337,6 @@ def _with_prior(sparse_map: SparseMap, track: Track, prior: PoseEstimate) -> Pos
     start, camera = by_images.T_camera_world, sparse_map.rig.camera
     found = refine_pose(camera, start, points, seen, prior, is_noise_known=True)
     return replace(by_images, T_camera_world=found.T_camera_world, covariance=found.covariance)
-
-
-def _by_patches(images: Images, observed: ObservedFeatures) -> ObservedFeatures:
-    """Return the features of a frame that shows little, as sure as their patches are."""
-    is_matched = not images.depth_scale
-    observations = with_patch_noise(images.left, observed.observations, is_matched)
-    return replace(observed, observations=observations)
 
 
 def is_near(T_camera_world: Array, expected: PoseEstimate | None) -> bool:

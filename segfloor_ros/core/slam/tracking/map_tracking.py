@@ -141,12 +141,10 @@ class Tracker:
         local_ids: NDArray[np.int32],
         T_camera_world: Array,
         known: PoseEstimate | None = None,
-        is_given: bool = False,
     ) -> Track | None:
         """Find which features show map points, and the pose, which is known to a few pixels; its
         observations have the disparity offset. None where there is no evidence for it. known: the
-        pose by the same images before; or, with is_given, where the camera is, and only its points
-        are looked for.
+        pose by the same images before.
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
@@ -166,16 +164,13 @@ class Tracker:
             guess_px = seen.uvd_px[points, 2] + offset_px
             measure_disparity(images, observations, rows, guess_px)
         measured = observations.take(rows).without_offset(offset_px)
-        found = None
-        if not is_given:
-            missed, by_chance = len(seen.ids) - len(rows), NARROW_PX * FOUND_PER_PX
-            searched = Searched(area_px2, range_of(images, measured), missed, by_chance)
-            found = self.consensus.refine(T_camera_world, ids, measured, searched, known)
-        if found is None or not is_proof(found.evidence(known)):
+        missed, by_chance = len(seen.ids) - len(rows), NARROW_PX * FOUND_PER_PX
+        searched = Searched(area_px2, range_of(images, measured), missed, by_chance)
+        estimate = self.consensus.refine(T_camera_world, ids, measured, searched, known)
+        if not is_proof(estimate.evidence(known)):
             if known is None:
                 return None
-            found = self.consensus.at(known, ids, measured)
-        estimate = found
+            estimate = self.consensus.at(known, ids, measured)
         rows, ids = rows[estimate.inliers], ids[estimate.inliers]
         point_id = np.full(len(features), NO_POINT, np.int32)
         point_id[rows] = ids

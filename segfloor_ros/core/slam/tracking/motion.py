@@ -1,31 +1,18 @@
-"""The motion of the camera: where it is, where it will be next, and the continuous frame `odom`.
-
-How far the camera turned since the last image, from the images alone: on a thumbnail a rotation
-looks like a shift. It is found without features by phase correlation, so that tracking survives a
-turn that its motion model did not foresee (the "small blurry image" of Klein and Murray, Improving
-the Agility of Keyframe-Based SLAM, 2008).
-"""
+"""The motion of the camera: where it is, where it will be next, and the continuous frame `odom`."""
 
 from __future__ import annotations
 
 from enum import Enum
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import BodySensors, LastPose, RelativeMotion
-from segfloor_ros.core.geometry import Array, invert, make_transform, rotation_from_angles
+from segfloor_ros.core.geometry import Array, invert, make_transform
 from segfloor_ros.core.slam.thresholds import SAME, SPEED_SIGMA
-from segfloor_ros.core.slam.tracking.images import SMALL_WIDTH_PX
-from segfloor_ros.core.slam.tracking.pose import ANYWHERE, PoseEstimate
+from segfloor_ros.core.slam.tracking.pose import ANYWHERE, PoseEstimate, knows_more
 from segfloor_ros.core.twists import adjoint, is_within, se3_exp, se3_log, without_drift
 
 MIN_STEP_S = 1e-3
-
-MIN_RESPONSE = 0.05
-"""Of the phase correlation of two images that have something in common."""
 
 MAX_TURN_RADPS = 6.0
 """A robot does not spin faster than once a second."""
@@ -157,6 +144,14 @@ class CameraMotion:
         motion = T_camera_world @ invert(self.T_camera_world)
         step_s = _step_s(self._last_stamp_ns, stamp_ns)
         return is_within(motion, (self._max_speed_mps * step_s, MAX_TURN_RADPS * step_s))
+
+    def knows_more(self, by_images: PoseEstimate, stamp_ns: int) -> bool:
+        """Whether sensors know some direction of a pose better than the images: wheels since the
+        last keyframe, others since the last pose.
+        """
+        measured = None if self.state.is_lost else self.measured(stamp_ns)
+        known = self.prior(stamp_ns) or measured
+        return known is not None and knows_more(known.covariance, by_images)
 
     def _expected_lost(self, stamp_ns: int) -> PoseEstimate | None:
         turned = self._turned(stamp_ns)
@@ -312,7 +307,7 @@ class Surprises:
 
     def __init__(self) -> None:
         self._squares = np.full(2, ACCELERATION**2)
-        self._count = LEARNT_FROM / 3
+        self._count = LEARNT_FROM / 10
 
     def learn(self, error: Array, step_s: float) -> None:
         """Take in the error (6,) of a motion that was expected to go on."""
@@ -386,43 +381,3 @@ def _step_s(before_ns: int, now_ns: int) -> float:
 def sigma_m(covariance: Array) -> float:
     """Return the standard deviation of the place of a pose with a covariance (6, 6)."""
     return float(np.sqrt(np.diag(covariance)[:3].max()))
-
-
-class ImageRotation:
-    """Compares each image with the one before."""
-
-    def __init__(self, camera: StereoCamera) -> None:
-        scale = SMALL_WIDTH_PX / 4 / camera.width
-        height = max(8, round(camera.height * scale))
-        self._size = (SMALL_WIDTH_PX // 4, height)
-        self._window = cv2.createHanningWindow(self._size, cv2.CV_32F)
-        self._focal = (camera.fx * scale, camera.fy * height / camera.height)
-        self._last: NDArray[np.uint8] | None = None
-        self._now: NDArray[np.uint8] | None = None
-
-    def see(self, image: NDArray[np.uint8]) -> None:
-        """Take in the next image (H, W), shrunk as optical flow takes it."""
-        self._last, self._now = self._now, image
-
-    def turn_since_last(self) -> Array:
-        """Return T_now_last (4, 4) between the last two images, a rotation about the camera's
-        centre.
-
-        The identity where there was no image before, or where the two have too little in common.
-        """
-        if self._last is None or self._now is None:
-            return np.eye(4)
-        last, now = (
-            cv2.GaussianBlur(
-                cv2.resize(image, self._size, interpolation=cv2.INTER_AREA).astype(np.float32),
-                (0, 0),
-                0.75,
-            )
-            for image in (self._last, self._now)
-        )
-        (du, dv), response = cv2.phaseCorrelate(last, now, self._window)
-        if response < MIN_RESPONSE:
-            return np.eye(4)
-        # A scene point that moves right by du lies further to the right now: it turned about +y.
-        turned_down, turned_left = np.arctan2((-dv, du), self._focal[::-1])
-        return make_transform(rotation_from_angles(0.0, turned_left, turned_down), np.zeros(3))

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from segfloor_ros.core.camera.pixels import SUBPIXEL, disparity_at
 from segfloor_ros.core.geometry import Array
@@ -408,25 +407,6 @@ def refine_disparity(
     disparity[rows] = uv_px[rows, 0] - found_u
     sigma[rows] = found.sigma_px[found.sound, 0]
     return disparity, sigma
-
-
-def with_patch_noise(
-    image: NDArray[np.float32], observations: Observations, is_matched: bool
-) -> Observations:
-    """Return observations (N) that have at least the noise that the patches of a grey image (H, W)
-    around them allow, and share what patches that overlap know. is_matched: whether disparities
-    are.
-    """
-    uv_px = observations.uvd_px[:, :2]
-    if len(uv_px) == 0:
-        return observations
-    fit = _Fit.of(sample_patches(image, uv_px), 2)
-    crowd = cKDTree(uv_px).query_ball_point(uv_px, HALF_PATCH_PX, return_length=True)
-    level = GREY_NOISE**2 * float(WINDOW.max()) * np.asarray(crowd, np.float64)
-    by_u, by_v = known_shift(fit.H[::3, ::3]) * level
-    by_d = known_shift(fit.H[:1, :1]) * level * is_matched
-    least = np.sqrt(np.column_stack([by_u, by_v, by_d[0]]))
-    return replace(observations, sigma_px=np.maximum(observations.sigma_px, least))
 
 
 def guess_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], uv_px: Array) -> Array:

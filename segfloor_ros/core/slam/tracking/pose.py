@@ -124,9 +124,13 @@ class PoseEstimate:
         information = np.linalg.inv(self.covariance)
         if expected is None:
             return self.log_ratio - gained(information, ANYWHERE)
+        of_prior = gained(information, expected.covariance) + self.surprise(expected)
+        return self.log_ratio - of_prior
+
+    def surprise(self, expected: PoseEstimate) -> float:
+        """Return by how many nats the pose is less likely than one just as expected."""
         error = se3_log(self.T_camera_world @ invert(expected.T_camera_world))
-        of_prior = surprise(error, expected.covariance + self.covariance)
-        return self.log_ratio - gained(information, expected.covariance) - of_prior
+        return surprise(error, expected.covariance + self.covariance)
 
 
 def solve_pnp(

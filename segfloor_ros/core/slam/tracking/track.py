@@ -47,8 +47,7 @@ class Track:
     measured. visible_ids: those that were looked for. observed: set when the pose was found by
     features. sigma_m: how uncertain the image
     leaves the place on the axis where it is most, 0 where it shows plenty. prior: the pose that
-    wheels measured, where the image does not contradict it. is_weak: whether sensors know some
-    direction of the motion better.
+    wheels measured, where the image does not contradict it.
     """
 
     estimate: PoseEstimate
@@ -58,7 +57,6 @@ class Track:
     observed: ObservedFeatures | None = None
     sigma_m: float = 0.0
     prior: PoseEstimate | None = None
-    is_weak: bool = False
 
     @property
     def T_camera_world(self) -> Array:

@@ -181,8 +181,8 @@ def test_poses_come_before_the_mount_is_known():
         here = replace(scene.mount, forward_m=0.1 * i)
         left, right, _, _ = replace(scene, mount=here).render()
         come.append(len(slam.process(StereoFrame(i, i * 10**8, left, right))))
-        if slam.provisional is not None:
-            positions.append(slam.provisional.T_odom_base[:3, 3])
+        if slam.session.provisional is not None:
+            positions.append(slam.session.provisional.T_odom_base[:3, 3])
     settled = come.index(max(come))
     assert settled > 0
     # One for each frame before, none since, and nothing is lost.

@@ -157,50 +157,50 @@ def test_a_wrong_scale_is_said_and_taken_into_account():
     np.testing.assert_allclose(motion.T_now_before, expected, atol=0.005)
 
 
-def on_edge_and_anywhere():
-    """Return two pictures, of an edge and of a texture, and pixels (N, 2) on the edge, or
-    anywhere.
-    """
-    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    rng, rows = np.random.default_rng(1), np.arange(25, CAMERA.height - 25, 10)
-    edge_px = np.full(CAMERA.height, 0.5 * CAMERA.width)
-    pixels = (
-        np.stack([edge_px[rows], rows], axis=1),
-        rng.uniform(12, [CAMERA.width - 12, CAMERA.height - 12], (len(rows), 2)),
-    )
-    faces = np.where(u > edge_px[:, None], 150.0, 90.0), rng.uniform(60, 160, u.shape)
-    images = [(face + rng.normal(0, 1.5, u.shape)).clip(0, 255) for face in faces]
-    return [(image.astype(np.float32), uv) for image, uv in zip(images, pixels, strict=True)]
+def picture_and_pixels(shows):
+    """Return a picture of an edge or of a texture, and pixels (N, 2) on the edge, or anywhere."""
+    rng, u = np.random.default_rng(1), np.arange(CAMERA.width, dtype=np.float64)
+    if shows == 'an edge':
+        rows = np.arange(20, CAMERA.height - 20, 10)
+        uv_px = np.stack([np.full(len(rows), CAMERA.width / 2), rows], axis=1)
+        image = np.tile(np.where(u > CAMERA.width / 2, 150.0, 90.0), (CAMERA.height, 1))
+    else:
+        uv_px = rng.uniform(12, [CAMERA.width - 12, CAMERA.height - 12], (150, 2))
+        image = rng.uniform(60, 160, (CAMERA.height, CAMERA.width))
+    return (image + rng.normal(0, 1.5, image.shape)).clip(0, 255).astype(np.float32), uv_px
 
 
-def seen_from(T_camera_world, image, uv_px):
-    """Return the track of points that an image shows just so from a pose (4, 4)."""
+def seen_from(slam, T_camera_world, image, uv_px):
+    """Return the track of points of the map, which an image shows just so from a pose (4, 4)."""
     points = CAMERA.back_project(uv_px, np.full(len(uv_px), 2.0))
     disparity = np.full(len(uv_px), CAMERA.disparity_times_depth / 2.0)
     sure = Observations(np.column_stack([uv_px, disparity]), np.full((len(uv_px), 3), 0.15))
     measured = with_patch_noise(image, sure, is_matched=True)
-    in_world = transform_points(invert(T_camera_world), points)
-    estimate = refine_pose(CAMERA, T_camera_world, in_world, measured)
     ids = np.arange(len(uv_px), dtype=np.int32)
+    slam.map.xyz_world[ids] = transform_points(invert(T_camera_world), points)
+    estimate = refine_pose(CAMERA, T_camera_world, slam.map.xyz_world[ids], measured)
     return Track(estimate, ids, measured, ids)
 
 
-@pytest.mark.parametrize('shows', ['an edge', 'a texture'])
-def test_points_that_slide_along_an_edge_do_not_outweigh_wheels(frames, monkeypatch, shows):
-    """Where wheels know the way along it better, a picture that says otherwise has no pose."""
+@pytest.mark.parametrize(('shows', 'slides_m'), [('an edge', 0.03), ('a texture', 0.2)])
+def test_points_that_slide_along_an_edge_do_not_outweigh_wheels(
+    frames, monkeypatch, shows, slides_m
+):
+    """On an edge the pose is where the wheels have it, and what has texture finds wheels out."""
     slam, _ = drive(frames[:9], wheel_poses())
-    for pose in wheel_poses()[5 * 8 + 1 : 5 * 9 + 1]:
-        slam.add(pose)
     front_end, frame = slam.front_end, frames[9]
-    image, uv_px = on_edge_and_anywhere()[shows == 'a texture']
-    slid = make_transform(np.eye(3), np.array([0.0, 0.05, 0.0]))
-    seen = seen_from(slid @ front_end.motion.predict(frame.stamp_ns), image, uv_px)
+    predicted = front_end.motion.predict(frame.stamp_ns)
+    slid = make_transform(np.eye(3), np.array([0.0, slides_m, 0.0]))
+    seen = seen_from(slam, slid @ predicted, *picture_and_pixels(shows))
     monkeypatch.setattr(FrontEnd, '_followed', lambda *_: seen)
     track = front_end.track(frame, Images.of(frame, CAMERA))
-    assert (track is None) == (shows == 'an edge')
-    if track is not None:
-        assert not track.is_weak and track.prior is None
-        np.testing.assert_allclose(track.T_camera_world, seen.T_camera_world)
+    found = front_end.motion.predict(frame.stamp_ns) if track is None else track.T_camera_world
+    off_m = np.linalg.norm((found @ invert(predicted))[:3, 3])
+    if shows == 'an edge':
+        assert track is None or track.is_weak
+        assert off_m < 0.2 * slides_m
+    else:
+        assert off_m == pytest.approx(slides_m, rel=0.1)
 
 
 def test_a_turn_without_a_picture_is_as_the_gyroscope_measures_it(frames):

@@ -11,10 +11,10 @@ from segfloor_ros.core.files.results import from_bytes, to_bytes
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.plugins.maps.saved_slam import load_slam, save_slam
-from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.places.loops import PlaceMatcher
 from segfloor_ros.core.slam.places.views import GroundViews, motion_between
 from segfloor_ros.core.slam.rig import Rig
+from segfloor_ros.core.slam.session import SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import NOTHING, Match
 
@@ -160,7 +160,7 @@ def test_a_session_that_starts_the_other_way_is_recognised_by_the_floor(
     room = StereoRoom(seed, floor=floor)
     for k, pose in enumerate(TO_IT):
         results += slam.process(room.frame(k, pose))
-    assert (slam.back_end.submap is Submap.KNOWN) == is_known
+    assert (slam.session.state is SessionState.MAPPING) == is_known
     found = results[-1].T_map_odom @ results[-1].T_odom_base
     off_m = np.linalg.norm((invert(invert(IN_CORRIDOR[0]) @ TO_IT[-1]) @ found)[:3, 3])
     assert (off_m < 0.02) == is_known
@@ -183,4 +183,4 @@ def test_a_keyframe_that_looks_like_another_place_than_its_floor_does_counts_for
     room = StereoRoom(0, floor=FLOOR)
     for k, pose in enumerate(TO_IT):
         slam.process(room.frame(k, pose))
-    assert slam.back_end.submap is Submap.OUTSIDE
+    assert slam.session.state is SessionState.OUTSIDE

@@ -8,12 +8,12 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.plugins.assembly import equipped_slam
+from segfloor_ros.core.plugins.maps.pruning import views_to_keep
 from segfloor_ros.core.slam.places.views import (
     SECOND_VISIT,
     covered_share,
     view_novelty,
     views_near,
-    views_to_keep,
 )
 from segfloor_ros.core.slam.rig import NEIGHBOURS
 from segfloor_ros.core.slam.settings import StereoSlamSettings

@@ -8,7 +8,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.plugins.assembly import equipped_slam
-from segfloor_ros.core.slam.mapping.back_end import Submap
+from segfloor_ros.core.slam.session import SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 
 SETTINGS = StereoSlamSettings(num_features=600)
@@ -51,7 +51,7 @@ def test_what_was_mapped_while_lost_comes_at_once_when_the_map_is_recognised(mer
     lost = [r.index for r in results if not r.tracked]
     assert lost == list(range(len(KNOWN), held))
     assert errors(batches[at] + batches[-1], poses).max() < 0.04
-    assert slam.back_end.submap is Submap.KNOWN
+    assert slam.session.state is SessionState.MAPPING
 
 
 def test_keyframes_of_a_submap_are_published_in_the_map(merged):
@@ -101,7 +101,7 @@ def test_a_submap_is_merged_only_where_the_robot_can_have_driven(waited_s, is_th
         drive(slam, way[-1:], lost + k, StereoRoom(seed=77 + k % 4))
     for k, pose in enumerate(way[:20]):
         drive(slam, [pose], found + 2 * k)
-    assert (slam.back_end.submap is Submap.LOST) is not is_there
+    assert (slam.session.state.holds_results) is not is_there
 
 
 def test_a_submap_that_is_never_recognised_is_not_in_the_map():
@@ -109,7 +109,7 @@ def test_a_submap_that_is_never_recognised_is_not_in_the_map():
     drive(slam, KNOWN)
     before = slam.to_arrays()
     batches = drive(slam, KNOWN, len(KNOWN), StereoRoom(seed=77))
-    assert slam.back_end.submap is Submap.LOST and batches[-1] == []
+    assert slam.session.state.holds_results and batches[-1] == []
     np.testing.assert_array_equal(
         slam.to_arrays()['keyframe_stamp_ns'], before['keyframe_stamp_ns']
     )
@@ -127,7 +127,7 @@ def test_of_two_that_were_not_joined_the_larger_is_the_map():
     poses = KNOWN + way
     drive(slam, KNOWN)
     batches = drive(slam, way, len(KNOWN), StereoRoom(seed=77))
-    assert slam.back_end.submap is Submap.LOST and batches[-1] == []
+    assert slam.session.state.holds_results and batches[-1] == []
     rest = slam.finish()
     mapped = [r for r in rest if r.tracked]
     began = slam.map.keyframes[0].stamp_ns
@@ -167,7 +167,7 @@ def test_a_camera_that_is_lost_again_is_looked_for_in_the_map():
     drive(slam, KNOWN, 20, StereoRoom(seed=77))
     batches = drive(slam, [KNOWN[10]] * 20, 40)
     results = [r for batch in batches for r in batch]
-    assert results[-1].tracked and slam.back_end.submap is Submap.KNOWN
+    assert results[-1].tracked and slam.session.state is SessionState.MAPPING
     assert errors(results[-1:], [KNOWN[10]] * 60).max() < 0.02
     # It is not looked for in the submap alone.
     found = next(r.index for r in results if r.tracked)

@@ -1,0 +1,66 @@
+"""Measures the mount of the camera while it drives, and says when it is known."""
+
+from __future__ import annotations
+
+from segfloor_ros.core.contracts import BodySensors, Mount, StereoFrame
+from segfloor_ros.core.geometry import Array, invert
+from segfloor_ros.core.slam.held_results import HeldResults
+from segfloor_ros.core.slam.optional import MountMeter
+from segfloor_ros.core.slam.rig import Rig
+
+LOOK_NS = 500_000_000
+"""While the mount is not known, the floor is measured this often between keyframes."""
+
+
+class MountSearch:
+    """Sets the mount of the rig by what a meter measures. meter: None where the mount is given."""
+
+    def __init__(
+        self, rig: Rig, meter: MountMeter | None, sensors: BodySensors, held: HeldResults
+    ) -> None:
+        self._rig, self._meter, self._sensors, self._held = rig, meter, sensors, held
+        self._looked_ns = 0
+
+    @property
+    def provisional(self) -> Mount | None:
+        """The estimate of a mount that is not known yet."""
+        if self._meter is None or self._rig.mount is not None:
+            return None
+        return self._meter.provisional
+
+    def use(self, mount: Mount) -> None:
+        """Use a given mount."""
+        self._rig.mount = mount
+        if self._meter is not None:
+            self._meter.use(mount)
+
+    def reset(self) -> None:
+        """Forget earlier frames: their poses relative to the next are not known."""
+        if self._meter is not None:
+            self._meter.reset()
+
+    def end(self) -> None:
+        """Keep the mount as it is."""
+        self._meter, self._rig.mount_may_change = None, False
+        self._held.keep(False)
+
+    def look(self, frame: StereoFrame, T_camera_world: Array, is_keyframe: bool) -> None:
+        """Measure the floor at a keyframe, and now and then at other frames: a camera that stands
+        may see it better than in its first image, or know by now where up is. If the floor shows
+        another mount than the one in use, all results are returned once more.
+        """
+        meter, rig = self._meter, self._rig
+        if meter is None or meter.is_final:
+            return
+        is_late = frame.stamp_ns - self._looked_ns >= LOOK_NS
+        if not is_keyframe and (rig.mount is not None or not is_late):
+            return
+        self._looked_ns = frame.stamp_ns
+        up = self._sensors.up_world
+        meter.add(frame.left, frame.right, invert(T_camera_world), up, is_keyframe)
+        if rig.mount is not None and meter.mount != rig.mount:
+            self._held.take_back()
+        if meter.remark is not None:
+            self._sensors.remark({'mount': meter.remark})
+        rig.mount, rig.mount_may_change = meter.mount, meter.may_change
+        self._held.keep(meter.may_change)
