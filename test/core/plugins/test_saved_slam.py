@@ -21,6 +21,8 @@ from segfloor_ros.core.slam.rig import OffsetEstimate, Rig
 from segfloor_ros.core.slam.session import SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import SparseMap
+from segfloor_ros.core.slam.tracking.frame_to_frame import FrameToFrame
+from segfloor_ros.core.slam.tracking.map_tracking import Tracker
 from segfloor_ros.core.twists import se3_exp
 
 SETTINGS = StereoSlamSettings(num_features=600)
@@ -289,10 +291,10 @@ def test_one_frame_finds_a_camera_that_is_where_it_was_lost(mapped, monkeypatch)
     slam = loaded(mapped, localize=False, last=mapped.last_pose)
     here, other = there(25)[-1], StereoRoom(seed=77)
     assert slam.process(ROOM.frame(30, here))[0].tracked
-    monkeypatch.setattr(
-        'segfloor_ros.core.slam.tracking.front_end.MIN_FOUND', 1.0
-    )  # the whole map alone
     assert not slam.process(other.frame(31, here))[0].tracked
+    # The whole map alone.
+    monkeypatch.setattr(Tracker, 'best', lambda *_: None)
+    monkeypatch.setattr(FrameToFrame, 'find', lambda *_: None)
     assert slam.process(ROOM.frame(32, here))[0].tracked
 
 

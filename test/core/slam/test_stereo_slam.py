@@ -283,7 +283,6 @@ def test_a_jump_without_any_prediction_is_found_by_descriptors(frames):
 
 
 def test_who_was_lost_must_find_what_should_be_there(frames, monkeypatch):
-    monkeypatch.setattr('segfloor_ros.core.slam.tracking.front_end.MIN_FOUND', 1.0)
     monkeypatch.setattr('segfloor_ros.core.slam.places.place_recognition.CHANCE_SHARE', 1.0)
     slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     black = np.zeros_like(frames[0].left)
@@ -293,8 +292,9 @@ def test_who_was_lost_must_find_what_should_be_there(frames, monkeypatch):
             frame = StereoRoom(seed=99).frame(4, planar_pose(1.0, 1.0, 2.0))
         if frame.index == 5:
             frame = StereoFrame(5, frame.stamp_ns, black, black)
+            monkeypatch.setattr('segfloor_ros.core.slam.tracking.evidence.ENOUGH_EVIDENCE', 1e9)
         tracked += [result.tracked for result in slam.process(frame)]
-    # With the ratio at 1 not even the right view is enough.
+    # Where no evidence is enough, not even the right view is.
     assert tracked == [True] * 4 + [False] * 4
 
 

@@ -10,12 +10,14 @@ from scipy.spatial.transform import Rotation
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.contracts import ImuSample, StereoFrame, WheelPose
-from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.geometry import invert, make_transform, transform_points
 from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.settings import StereoSlamSettings
+from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 from segfloor_ros.core.slam.tracking.images import Images
-from segfloor_ros.core.slam.tracking.pose import PoseEstimate
+from segfloor_ros.core.slam.tracking.patch_alignment import with_patch_noise
+from segfloor_ros.core.slam.tracking.pose import refine_pose
 from segfloor_ros.core.slam.tracking.track import Track
 
 SETTINGS = StereoSlamSettings(num_features=800)
@@ -155,26 +157,50 @@ def test_a_wrong_scale_is_said_and_taken_into_account():
     np.testing.assert_allclose(motion.T_now_before, expected, atol=0.005)
 
 
-def test_points_that_slide_along_an_edge_do_not_outweigh_wheels(on_wheels):
-    slam, _ = on_wheels
-    for measured in wheel_poses()[5 * FRAMES - 4 :]:
-        slam.add(measured)
-    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    rng, edge_px = np.random.default_rng(1), 0.5 * CAMERA.width + 0.3 * (v[:, 0] - 50)
-    rows = rng.integers(20, CAMERA.height - 20, 150)
-    on_edge = np.stack([edge_px[rows], rows], axis=1)
-    pose, sure = slam.front_end.motion.predict(round(FRAMES * 1e8)), 1e-6 * np.eye(6)
-    estimate = PoseEstimate(pose, np.ones(150, bool), sure, 1.0)
-    anywhere = rng.uniform(10, [CAMERA.width - 10, CAMERA.height - 10], (150, 2))
-    for uv_px, texture, expected in ((on_edge, 0.0, False), (anywhere, 30.0, True)):
-        ids = np.arange(150, dtype=np.int32)
-        measured = Observations(np.column_stack([uv_px, np.full(150, np.nan)]), np.ones((150, 3)))
-        track = Track(estimate, ids, measured, ids)
-        grey = np.where(u > edge_px[:, None], 150, 90) + rng.normal(0, 1.5 + texture, u.shape)
-        picture = np.clip(grey, 0, 255).astype(np.uint8)
-        frame = StereoFrame(FRAMES, round(FRAMES * 1e8), picture, picture)
-        images = Images.of(frame, CAMERA)
-        assert slam.front_end.is_believable(track, images, frame.stamp_ns) == expected
+def picture_and_pixels(shows):
+    """Return a picture of an edge or of a texture, and pixels (N, 2) on the edge, or anywhere."""
+    rng, u = np.random.default_rng(1), np.arange(CAMERA.width, dtype=np.float64)
+    if shows == 'an edge':
+        rows = np.arange(20, CAMERA.height - 20, 10)
+        uv_px = np.stack([np.full(len(rows), CAMERA.width / 2), rows], axis=1)
+        image = np.tile(np.where(u > CAMERA.width / 2, 150.0, 90.0), (CAMERA.height, 1))
+    else:
+        uv_px = rng.uniform(12, [CAMERA.width - 12, CAMERA.height - 12], (150, 2))
+        image = rng.uniform(60, 160, (CAMERA.height, CAMERA.width))
+    return (image + rng.normal(0, 1.5, image.shape)).clip(0, 255).astype(np.float32), uv_px
+
+
+def seen_from(slam, T_camera_world, image, uv_px):
+    """Return the track of points of the map, which an image shows just so from a pose (4, 4)."""
+    points = CAMERA.back_project(uv_px, np.full(len(uv_px), 2.0))
+    disparity = np.full(len(uv_px), CAMERA.disparity_times_depth / 2.0)
+    sure = Observations(np.column_stack([uv_px, disparity]), np.full((len(uv_px), 3), 0.15))
+    measured = with_patch_noise(image, sure, is_matched=True)
+    ids = np.arange(len(uv_px), dtype=np.int32)
+    slam.map.xyz_world[ids] = transform_points(invert(T_camera_world), points)
+    estimate = refine_pose(CAMERA, T_camera_world, slam.map.xyz_world[ids], measured)
+    return Track(estimate, ids, measured, ids)
+
+
+@pytest.mark.parametrize(('shows', 'slides_m'), [('an edge', 0.03), ('a texture', 0.2)])
+def test_points_that_slide_along_an_edge_do_not_outweigh_wheels(
+    frames, monkeypatch, shows, slides_m
+):
+    """On an edge the pose is where the wheels have it, and what has texture finds wheels out."""
+    slam, _ = drive(frames[:9], wheel_poses())
+    front_end, frame = slam.front_end, frames[9]
+    predicted = front_end.motion.predict(frame.stamp_ns)
+    slid = make_transform(np.eye(3), np.array([0.0, slides_m, 0.0]))
+    seen = seen_from(slam, slid @ predicted, *picture_and_pixels(shows))
+    monkeypatch.setattr(FrontEnd, '_followed', lambda *_: seen)
+    track = front_end.track(frame, Images.of(frame, CAMERA))
+    found = front_end.motion.predict(frame.stamp_ns) if track is None else track.T_camera_world
+    off_m = np.linalg.norm((found @ invert(predicted))[:3, 3])
+    if shows == 'an edge':
+        assert track is None or track.is_weak
+        assert off_m < 0.2 * slides_m
+    else:
+        assert off_m == pytest.approx(slides_m, rel=0.1)
 
 
 def test_a_turn_without_a_picture_is_as_the_gyroscope_measures_it(frames):

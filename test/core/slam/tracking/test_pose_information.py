@@ -149,6 +149,15 @@ def test_measured_depth_is_as_sure_on_an_edge_as_elsewhere():
     assert by_images.sigma_px[0, 2] > 3.0 and by_depth.sigma_px[0, 2] == 0.5
 
 
+def test_points_at_the_border_and_none_at_all_have_the_noise_of_what_is_there():
+    image = noisy(np.full((40, 60), 90.0)).astype(np.float32)
+    none = Observations(np.zeros((0, 3)), np.zeros((0, 3)))
+    assert with_patch_noise(image, none, is_matched=True) is none
+    at = np.array([[0.0, 0.0, 3.0], [59.4, 39.4, 3.0]])
+    sure = Observations(at, np.full((2, 3), 0.5))
+    assert (with_patch_noise(image, sure, is_matched=True).sigma_px > 2.0).all()
+
+
 def test_a_prior_leaves_the_noise_of_the_images_as_it_is(monkeypatch):
     weigh, weighed = FrontEnd._weighed, []
 
@@ -182,12 +191,15 @@ def test_a_pose_that_the_images_hardly_determine_is_said_to_be_uncertain(monkeyp
     slam = equipped_slam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
     frames = [room.frame(k, planar_pose(0.04 * k, 0, 0)) for k in range(4)]
     seen = [result.state for frame in frames[:2] for result in slam.process(frame)]
-    monkeypatch.setattr('segfloor_ros.core.slam.tracking.front_end.PLENTY', 10_000)
     seen += [result.state for result in slam.process(frames[2])]
-    monkeypatch.setattr(
-        'segfloor_ros.core.slam.tracking.front_end._with_prior',
-        lambda _, track, *__: replace(track.estimate, covariance=np.eye(6) * 0.02**2),
-    )
+    follow = FrontEnd._followed
+
+    def follow_blurred(front_end, *args):
+        track = follow(front_end, *args)
+        unsure = replace(track.estimate, covariance=np.eye(6) * 0.02**2)
+        return replace(track, estimate=unsure)
+
+    monkeypatch.setattr(FrontEnd, '_followed', follow_blurred)
     seen += [result.state for result in slam.process(frames[3])]
     assert seen[:3] == ['tracking'] * 3
     assert seen[3].startswith('tracking: what is seen leaves the place uncertain by 2')
