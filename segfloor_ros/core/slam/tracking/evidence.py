@@ -49,15 +49,21 @@ class Mixture:
 
     @staticmethod
     def fit(
-        chi2: Array, dimensions: Array, log_chance: Array, factor: float, missed: int = 0
+        chi2: Array,
+        dimensions: Array,
+        log_chance: Array,
+        factor: float,
+        missed: int = 0,
+        largest: float = LARGEST_FACTOR,
     ) -> Mixture:
         """Return the likeliest mixture (expectation maximisation: Dempster et al. 1977).
 
         chi2: (N,) squared residuals over what the noise is announced to be. dimensions: (N,) of
         each. log_chance: (N,) logarithm of what is searched over what the noise fills. factor: of
-        the noise, to begin with. missed: how many more were looked for, and gave no match.
+        the noise, to begin with, and the largest one. missed: how many more were looked for, and
+        gave no match.
         """
-        share, known, factor = 0.5, KNOWN_AS, min(factor, LARGEST_FACTOR)
+        share, known, factor = 0.5, KNOWN_AS, min(factor, largest)
         for _ in range(ROUNDS):
             log_right = log_chance - dimensions * math.log(factor) - chi2 / (2 * factor**2)
             right = share * np.exp(np.minimum(log_right, 700.0))
@@ -65,7 +71,7 @@ class Mixture:
             share = float((probability.sum() + 0.5) / (len(chi2) + missed + 1.0))
             total = float(probability @ np.where(probability > 0, chi2, 0.0))
             variance = (known + total) / (known + float(probability @ dimensions))
-            factor = math.sqrt(min(max(variance, 1.0), LARGEST_FACTOR**2))
+            factor = math.sqrt(min(max(variance, 1.0), largest**2))
         log_right = log_chance - dimensions * math.log(factor) - chi2 / (2 * factor**2)
         right = share * np.exp(np.minimum(log_right, 700.0))
         log_ratio = float(np.log(1.0 - share + right).sum() + missed * math.log(1.0 - share))

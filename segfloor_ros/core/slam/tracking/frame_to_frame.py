@@ -74,19 +74,23 @@ class FrameToFrame:
         before, before_images, before_estimate = self._last
         old, new = self._corners(before, before_images), self._corners(frame, images)
         rows, new_rows = match_unguided(old.descriptor, new.descriptor, max_hamming=256)
-        points, found = self._points(before, before_images, old.take(rows))
-        uv_px = new.uv_px[new_rows[found]].astype(np.float64)
-        rows = distinct(uv_px)
-        points, uv_px = points[rows], uv_px[rows]
-        start = solve_pnp(self._camera, points, uv_px, ITERATIONS)
+        known = self._measured(before, before_images, old.take(rows))
+        far = np.isnan(known.uvd_px[:, 2]) | (known.uvd_px[:, 2] <= known.sigma_px[:, 2])
+        rows = np.flatnonzero(~far)
+        rows = rows[distinct(new.uv_px[new_rows[rows]])]
+        known, seen = known.take(rows), self._measured(frame, images, new.take(new_rows[rows]))
+        uv_px, depth = known.uvd_px[:, :2], self._camera.disparity_times_depth / known.uvd_px[:, 2]
+        points = self._camera.back_project(uv_px, depth)
+        start = solve_pnp(self._camera, points, seen.uvd_px[:, :2], ITERATIONS)
         if start is None:
             return None
-        uvd = np.column_stack([uv_px, np.full(len(uv_px), np.nan)])
-        observations = Observations(uvd, np.full(uvd.shape, SIGMA_FLOW_PX))
-        searched = Searched(crowded_area_px2(uv_px, self._camera.width * self._camera.height))
-        moved = refine_pose(
-            self._camera, start[0], points, observations, searched=searched, first=start[1]
-        )
+        seen.sigma_px[:, 2] = np.hypot(seen.sigma_px[:, 2], known.sigma_px[:, 2])
+        area_px2 = crowded_area_px2(seen.uvd_px[:, :2], self._camera.width * self._camera.height)
+        disparity = seen.uvd_px[seen.has_disparity, 2]
+        range_px = float(np.ptp(disparity)) if len(disparity) else None
+        # What RANSAC takes for right lies within two standard deviations.
+        searched = Searched(area_px2, range_px, largest_factor=SAME_PX / (2 * SIGMA_FLOW_PX))
+        moved = refine_pose(self._camera, start[0], points, seen, searched=searched, first=start[1])
         # Seen from far away all points are in one place, where many a corner is.
         near = PoseEstimate(np.eye(4), moved.inliers, ANYWHERE, 1.0)
         if not is_proof(moved.evidence(near)):
@@ -112,32 +116,24 @@ class FrameToFrame:
         self._seen = frame.stamp_ns, features
         return features
 
-    def _points(
-        self, frame: StereoFrame, images: Images, features: Features
-    ) -> tuple[Array, NDArray[np.intp]]:
-        """Return the points (M, 3) that features show, in the camera's axes, and which these are
-        (M,).
-        """
+    def _measured(self, frame: StereoFrame, images: Images, features: Features) -> Observations:
+        """Return what features (N) measure, freed of the disparity offset."""
         uvd = np.full((len(features), 3), np.nan)
         uvd[:, :2] = features.uv_px
-        observations = Observations(uvd, np.ones_like(uvd))
+        observations = Observations(uvd, np.full(uvd.shape, SIGMA_FLOW_PX))
         guess: Array = np.zeros(len(features))
         if not images.depth_scale:
             guess = guess_disparity(frame.left, frame.right, uvd[:, :2])
         rows = np.flatnonzero(np.isfinite(guess))
         measure_disparity(images, observations, rows, guess[rows], SAME_PX)
-        seen = observations.without_offset(self._rig.offset.value_px)
-        with np.errstate(invalid='ignore'):
-            found = np.flatnonzero(seen.uvd_px[:, 2] > seen.sigma_px[:, 2])
-        depth = self._camera.disparity_times_depth / seen.uvd_px[found, 2]
-        return self._camera.back_project(seen.uvd_px[found, :2], depth), found
+        return observations.without_offset(self._rig.offset.value_px)
 
 
 def distinct(uv_px: Array) -> NDArray[np.intp]:
     """Return one row (M,) of pixels (N, 2) for each cell of twice the noise: a corner that is found
     at several levels of the pyramid counts once.
     """
-    cells = np.floor(uv_px / (2 * SAME_PX)).astype(np.intp)
+    cells = np.floor(uv_px / (1.5 * SAME_PX)).astype(np.intp)
     return np.sort(np.unique(cells, axis=0, return_index=True)[1])
 
 

@@ -35,6 +35,7 @@ from segfloor_ros.core.slam.rig import (
 from segfloor_ros.core.slam.sparse_map import SparseMap
 from segfloor_ros.core.slam.thresholds import PROOF
 from segfloor_ros.core.slam.tracking.evidence import (
+    LARGEST_FACTOR,
     Mixture,
     gained,
     is_proof,
@@ -79,13 +80,14 @@ PROVEN = math.log(PROOF)
 class Searched:
     """Where matches were looked for. area_px2: (N,) or one for all. range_px: of disparities.
     None: the whole image. missed: how many points more were looked for, and not found. by_chance:
-    the probability to find something where the point is not.
+    the probability to find something where the point is not. largest_factor: of the noise.
     """
 
     area_px2: Array | float | None = None
     range_px: float | None = None
     missed: int = 0
     by_chance: float = 1.0
+    largest_factor: float = LARGEST_FACTOR
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Searched:
         """Return that of the chosen matches."""
@@ -199,7 +201,9 @@ def refine_pose(
         rays, _, chi2 = seen.at(pose)
         chi2[rays[2] >= 1 / MIN_DEPTH_M] = 1e12
         start = 1.0 if is_noise_known else math.sqrt(max(1.0, float(np.median(chi2 / seen.median))))
-        mixture = Mixture.fit(chi2, seen.dimensions, log_chance, start, searched.missed)
+        mixture = Mixture.fit(
+            chi2, seen.dimensions, log_chance, start, searched.missed, searched.largest_factor
+        )
         factor = 1.0 if is_noise_known else mixture.factor
         before, inliers = inliers, chi2 <= factor**2 * seen.limit
         is_enough = prior is not None or inliers.sum() >= 4
