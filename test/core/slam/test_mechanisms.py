@@ -13,7 +13,7 @@ from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.mapping.keyframe_mapping import find_duplicates
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.tracking.images import FeatureExtractor, Images
-from segfloor_ros.core.slam.tracking.map_tracking import LocalMap, Tracker
+from segfloor_ros.core.slam.tracking.map_tracking import LocalMap, Start, Tracker
 
 SETTINGS = StereoSlamSettings(num_features=600)
 
@@ -52,7 +52,8 @@ def test_patches_give_the_pose_better_than_corners(seed):
     frame = room.frame(1, moved)
     features = FeatureExtractor(SETTINGS).extract(frame.left)
     ids = slam.map.points_of(np.array([0]))
-    track = Tracker(slam.map).track(Images.of(frame, CAMERA), features, ids, [np.eye(4)])
+    starts = [Start(np.eye(4))]
+    track = Tracker(slam.map).best(Images.of(frame, CAMERA), features, ids, starts, None)
     truth = invert(MOUNT.T_base_left) @ moved @ MOUNT.T_base_left
     error = track.T_camera_world @ truth
     assert np.linalg.norm(error[:3, 3]) < 0.0015

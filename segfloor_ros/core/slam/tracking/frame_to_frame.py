@@ -25,7 +25,13 @@ from segfloor_ros.core.slam.tracking.images import (
     match_unguided,
 )
 from segfloor_ros.core.slam.tracking.patch_alignment import guess_disparity, measure_disparity
-from segfloor_ros.core.slam.tracking.pose import PoseEstimate, Searched, refine_pose, solve_pnp
+from segfloor_ros.core.slam.tracking.pose import (
+    ANYWHERE,
+    PoseEstimate,
+    Searched,
+    refine_pose,
+    solve_pnp,
+)
 from segfloor_ros.core.timing import timed
 from segfloor_ros.core.twists import adjoint, without_drift
 
@@ -81,7 +87,9 @@ class FrameToFrame:
         moved = refine_pose(
             self._camera, start[0], points, observations, searched=searched, first=start[1]
         )
-        if not is_proof(moved.evidence()):
+        # Seen from far away all points are in one place, where many a corner is.
+        near = PoseEstimate(np.eye(4), moved.inliers, ANYWHERE, 1.0)
+        if not is_proof(moved.evidence(near)):
             return None
         A = adjoint(moved.T_camera_world)
         return replace(

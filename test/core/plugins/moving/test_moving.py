@@ -167,4 +167,4 @@ def walking_into_the_image(index):
 def test_what_suddenly_fills_most_of_the_image_does_not_take_the_pose_along():
     drive = MovingDrive(walking_into_the_image)
     assert (drive.mask(22) > 0).mean() > 0.7
-    assert worst_error_m(drive, run(drive)) < 0.01
+    assert worst_error_m(drive, run(drive)) < 0.02

@@ -128,7 +128,8 @@ def test_motions_and_ups_are_those_of_the_keyframes_wherever_these_are_in_a_prob
     motions = [RelativeMotion(T @ invert(b), COVARIANCE) for b, T in pairwise(DRIVE)]
     ups = [Up(T[:3, :3] @ UP, 0.01) for T in DRIVE]
     keyframes = [
-        SimpleNamespace(motion=m, up=u) for m, u in zip([None, *motions], ups, strict=True)
+        SimpleNamespace(motion=m, up=u, retired=None)
+        for m, u in zip([None, *motions], ups, strict=True)
     ]
     links, levels = factors_of(keyframes, SLOT, Up(UP, 0.01))
     # No motion ends at the first one, and none at or after the one that is left out counts.
