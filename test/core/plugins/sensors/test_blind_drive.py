@@ -16,7 +16,7 @@ from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 from segfloor_ros.core.slam.tracking.images import Images
-from segfloor_ros.core.slam.tracking.patch_alignment import with_patch_noise
+from segfloor_ros.core.slam.tracking.patch_alignment import align_patches, sample_patches
 from segfloor_ros.core.slam.tracking.pose import refine_pose
 from segfloor_ros.core.slam.tracking.track import Track
 
@@ -174,30 +174,33 @@ def seen_from(slam, T_camera_world, image, uv_px):
     """Return the track of points of the map, which an image shows just so from a pose (4, 4)."""
     points = CAMERA.back_project(uv_px, np.full(len(uv_px), 2.0))
     disparity = np.full(len(uv_px), CAMERA.disparity_times_depth / 2.0)
-    sure = Observations(np.column_stack([uv_px, disparity]), np.full((len(uv_px), 3), 0.15))
-    measured = with_patch_noise(image, sure, is_matched=True)
+    patches, zoom = sample_patches(image, uv_px), np.ones(len(uv_px))
+    sigma_px = np.column_stack([align_patches(patches, image, uv_px, zoom).sigma_px, zoom])
+    measured = Observations(np.column_stack([uv_px, disparity]), np.maximum(sigma_px, 0.15))
     ids = np.arange(len(uv_px), dtype=np.int32)
     slam.map.xyz_world[ids] = transform_points(invert(T_camera_world), points)
     estimate = refine_pose(CAMERA, T_camera_world, slam.map.xyz_world[ids], measured)
     return Track(estimate, ids, measured, ids)
 
 
-@pytest.mark.parametrize(('shows', 'slides_m'), [('an edge', 0.03), ('a texture', 0.2)])
+@pytest.mark.parametrize(('shows', 'slides_m'), [('an edge', 0.1), ('a texture', 0.2)])
 def test_points_that_slide_along_an_edge_do_not_outweigh_wheels(
     frames, monkeypatch, shows, slides_m
 ):
     """On an edge the pose is where the wheels have it, and what has texture finds wheels out."""
     slam, _ = drive(frames[:9], wheel_poses())
+    for pose in wheel_poses()[5 * 8 + 1 : 5 * 9 + 1]:
+        slam.add(pose)
     front_end, frame = slam.front_end, frames[9]
     predicted = front_end.motion.predict(frame.stamp_ns)
     slid = make_transform(np.eye(3), np.array([0.0, slides_m, 0.0]))
     seen = seen_from(slam, slid @ predicted, *picture_and_pixels(shows))
     monkeypatch.setattr(FrontEnd, '_followed', lambda *_: seen)
     track = front_end.track(frame, Images.of(frame, CAMERA))
-    found = front_end.motion.predict(frame.stamp_ns) if track is None else track.T_camera_world
-    off_m = np.linalg.norm((found @ invert(predicted))[:3, 3])
+    if track is None:
+        front_end.bridge(frame, '')
+    off_m = np.linalg.norm((front_end.motion.T_camera_world @ invert(predicted))[:3, 3])
     if shows == 'an edge':
-        assert track is None or track.is_weak
         assert off_m < 0.2 * slides_m
     else:
         assert off_m == pytest.approx(slides_m, rel=0.1)

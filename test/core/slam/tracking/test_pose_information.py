@@ -13,7 +13,12 @@ from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
-from segfloor_ros.core.slam.tracking.patch_alignment import with_patch_noise
+from segfloor_ros.core.slam.tracking.patch_alignment import (
+    MIN_SIGMA_DISPARITY,
+    MIN_SIGMA_PIXEL,
+    align_patches,
+    sample_patches,
+)
 from segfloor_ros.core.slam.tracking.pose import (
     FIRST_INFORMATION,
     PoseEstimate,
@@ -38,6 +43,16 @@ def noisy(image):
     return np.clip(image + RNG.normal(0, 1.5, image.shape), 0, 255).astype(np.uint8)
 
 
+def sigmas_px(image, uv_px):
+    """Return the standard deviations (N, 3) of pixels (N, 2) and disparities, by their patches."""
+    grey, zoom = image.astype(np.float32), np.ones(len(uv_px))
+    patches = sample_patches(grey, uv_px)
+    by_pixel = align_patches(patches, grey, uv_px, zoom).sigma_px
+    by_row = align_patches(patches, grey, uv_px, zoom, along_row=True).sigma_px
+    sigma_px = np.column_stack([by_pixel, by_row[:, 0]])
+    return np.maximum(sigma_px, [MIN_SIGMA_PIXEL, MIN_SIGMA_PIXEL, MIN_SIGMA_DISPARITY])
+
+
 NOTHING = PoseEstimate(np.eye(4), np.zeros(0, bool), np.diag(1 / FIRST_INFORMATION), 1.0)
 
 
@@ -45,8 +60,8 @@ def fused(image, uv_px, prior=NOTHING, depth_m=2.0):
     """Return the pose by points in one plane, seen where they are from the origin, and a prior."""
     points = CAMERA.back_project(uv_px, np.full(len(uv_px), depth_m))
     disparity = np.full(len(uv_px), CAMERA.disparity_times_depth / depth_m)
-    sure = Observations(np.column_stack([uv_px, disparity]), np.full((len(uv_px), 3), 0.01))
-    measured = with_patch_noise(image.astype(np.float32), sure, is_matched=True)
+    uvd_px = np.column_stack([uv_px, disparity])
+    measured = Observations(uvd_px, sigmas_px(image, uv_px))
     return refine_pose(CAMERA, np.eye(4), points, measured, prior, is_noise_known=True)
 
 
@@ -81,14 +96,6 @@ def test_corners_and_weak_textures_determine_the_place_to_millimetres():
     assert sigmas_m(corners, at).max() < 0.003
     weak = noisy(100 + 6 * np.sin(U * 0.9) * np.sin(V * 1.1))
     assert sigmas_m(weak, anywhere(100)).max() < 0.003
-
-
-def test_points_whose_patches_overlap_count_as_one():
-    texture = noisy(RNG.uniform(60, 160, U.shape))
-    places = anywhere(30)
-    once = sigmas_m(texture, places)
-    often = sigmas_m(texture, np.repeat(places, 10, axis=0) + RNG.uniform(-1, 1, (300, 2)))
-    np.testing.assert_allclose(often, once, rtol=0.3)
 
 
 def test_no_point_determines_nothing():
@@ -140,22 +147,10 @@ def test_pixels_are_as_sure_with_wheels_as_without_where_the_images_know_more():
     assert median_sigma_px(wheels) < 1.1 * median_sigma_px([])
 
 
-def test_measured_depth_is_as_sure_on_an_edge_as_elsewhere():
-    image = noisy(np.where(V - MIDDLE[1] > 0, 150.0, 100.0))
-    sure = Observations(np.array([[*MIDDLE, 10.0]]), np.full((1, 3), 0.5))
-    by_images, by_depth = (
-        with_patch_noise(image.astype(np.float32), sure, matched) for matched in (True, False)
-    )
-    assert by_images.sigma_px[0, 2] > 3.0 and by_depth.sigma_px[0, 2] == 0.5
-
-
 def test_points_at_the_border_and_none_at_all_have_the_noise_of_what_is_there():
     image = noisy(np.full((40, 60), 90.0)).astype(np.float32)
-    none = Observations(np.zeros((0, 3)), np.zeros((0, 3)))
-    assert with_patch_noise(image, none, is_matched=True) is none
-    at = np.array([[0.0, 0.0, 3.0], [59.4, 39.4, 3.0]])
-    sure = Observations(at, np.full((2, 3), 0.5))
-    assert (with_patch_noise(image, sure, is_matched=True).sigma_px > 2.0).all()
+    assert sigmas_px(image, np.zeros((0, 2))).shape == (0, 3)
+    assert (sigmas_px(image, np.array([[0.0, 0.0], [59.4, 39.4]])) > 2.0).all()
 
 
 def test_a_prior_leaves_the_noise_of_the_images_as_it_is(monkeypatch):
@@ -180,10 +175,8 @@ def test_a_prior_leaves_the_noise_of_the_images_as_it_is(monkeypatch):
 
 def test_a_pixel_on_an_edge_is_sure_across_it_alone():
     image = noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0))
-    uvd_px = np.array([[MIDDLE[0], MIDDLE[1], np.nan]])
-    sure = Observations(uvd_px, np.full((1, 3), 0.5))
-    sigma_px = with_patch_noise(image.astype(np.float32), sure, is_matched=True).sigma_px[0]
-    assert sigma_px[0] == 0.5 and sigma_px[1] > 3.0
+    (sigma_px,) = sigmas_px(image, MIDDLE[None])
+    assert sigma_px[0] < 0.2 and sigma_px[1] > 3.0
 
 
 def test_a_pose_that_the_images_hardly_determine_is_said_to_be_uncertain(monkeypatch):
