@@ -108,14 +108,9 @@ SLAM: dict[str, Mechanism] = {
     ),
     'relocalisation by several frames': Mechanism({'core.slam.places.place_recognition.PROOF': 1}),
     'map parts': Mechanism({'core.slam.session.LOST_NS': 1 << 62}),
-    'two motions distinguished': Mechanism(
-        {
-            'core.slam.tracking.pose.differ': lambda a, b: False,
-            'core.slam.tracking.pose.KNOWN_NOISE': 1e9,
-        }
-    ),
+    'two motions distinguished': Mechanism({'core.slam.tracking.pose.differ': lambda a, b: False}),
     'motion so far': Mechanism(
-        {'core.slam.tracking.front_end.FrontEnd._carry_on': lambda *a: a[-1]}
+        {'core.slam.tracking.front_end.FrontEnd._standing': lambda *a: a[-2]}
     ),
     'images weighed against wheels': Mechanism(
         {'core.slam.tracking.front_end.FrontEnd._weighed': lambda self, track, images: track}
