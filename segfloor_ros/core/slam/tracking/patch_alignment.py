@@ -58,7 +58,7 @@ Patches = NDArray[np.float32]
 ALIASED = 0.1
 """Share of the slopes across an edge that its sampling in steps of pixels shows along it."""
 
-LEAST_ENERGY = 1e-3
+LEAST_ENERGY = 3e-5
 """Mean square of a slope, in grey levels squared: of an edge, along it; of a plain face."""
 
 
