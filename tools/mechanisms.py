@@ -48,6 +48,10 @@ def _no_rows(*_: object, **__: object) -> Any:
     return np.zeros(0, np.intp)
 
 
+def _found(front_end: Any, images: Any, features: Any, found: Any, expected: Any) -> Any:
+    return found
+
+
 def _first(value: Any, *_: object, **__: object) -> Any:
     return value
 
@@ -109,11 +113,22 @@ SLAM: dict[str, Mechanism] = {
     'relocalisation by several frames': Mechanism({'core.slam.places.place_recognition.PROOF': 1}),
     'map parts': Mechanism({'core.slam.session.LOST_NS': 1 << 62}),
     'two motions distinguished': Mechanism({'core.slam.tracking.pose.differ': lambda a, b: False}),
-    'motion so far': Mechanism(
-        {'core.slam.tracking.front_end.FrontEnd._standing': lambda *a: a[-2]}
+    'motion so far': Mechanism({'core.slam.tracking.front_end.FrontEnd._standing': _found}),
+    'noise of a motion that goes on': Mechanism(
+        {'core.slam.tracking.motion.Surprises.learn': _none}
+    ),
+    'frame to frame': Mechanism({'core.slam.tracking.frame_to_frame.FrameToFrame.find': _none}),
+    'crowds of corners': Mechanism(
+        {'core.slam.tracking.frame_to_frame.crowded_area_px2': lambda _, whole_px2: whole_px2}
     ),
     'images weighed against wheels': Mechanism(
-        {'core.slam.tracking.front_end.FrontEnd._weighed': lambda self, track, images: track}
+        {'core.slam.tracking.front_end.FrontEnd._weighed': lambda self, track: track}
+    ),
+    'sensors that know more than images': Mechanism(
+        {'core.slam.tracking.motion.CameraMotion.knows_more': lambda *_: False}
+    ),
+    'error of what a keyframe shows anew': Mechanism(
+        {'core.slam.tracking.track.ObservedFeatures.known_share': 1.0}
     ),
     'bias of the gyroscope at rest': Mechanism(
         {'core.plugins.sensors.body_motion.AT_REST': (-1.0, -1.0)}

@@ -57,3 +57,15 @@ def test_patches_give_the_pose_better_than_corners(seed):
     truth = invert(MOUNT.T_base_left) @ moved @ MOUNT.T_base_left
     error = track.T_camera_world @ truth
     assert np.linalg.norm(error[:3, 3]) < 0.0015
+
+
+def test_what_a_keyframe_shows_anew_shares_its_error():
+    """What wheels measure from there is compared with points that err as the keyframe does."""
+    slam, room = equipped_slam(CAMERA, SETTINGS, MOUNT), StereoRoom()
+    for k in range(12):
+        (result,) = slam.process(room.frame(k, planar_pose(0.08 * k, 0, 0.06 * k)))
+        if k and result.keyframe is not None:
+            break
+    motion = slam.front_end.motion
+    at_keyframe = motion.since_keyframe.covariance.trace()
+    assert 0.2 * motion.covariance.trace() < at_keyframe < 0.95 * motion.covariance.trace()

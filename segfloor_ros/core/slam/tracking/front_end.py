@@ -304,8 +304,10 @@ class FrontEnd:
         features = self.extractor.extract(frame.left, images.excluded)
         if track is None or len(track.point_ids) == 0:
             if not self._map.keyframes:
-                first = self.motion.T_camera_world
-                self.motion.take(first, np.zeros((6, 6)), frame.stamp_ns, T_seen=first)
+                first, sure = self.motion.T_camera_world, np.zeros((6, 6))
+                self.motion.take(first, sure, frame.stamp_ns, T_seen=first)
+                estimate = PoseEstimate(first, np.zeros(0, bool), sure, 1.0)
+                self.frame_to_frame.see(frame, images, estimate)
             none = np.full(len(features), NO_POINT, np.int32)
             return ObservedFeatures(features, self.tracker.pixel_observations(features), none)
         pose = self.motion.T_camera_world

@@ -18,6 +18,7 @@ from segfloor_ros.core.slam.mapping.normal_equations import (
     cost,
     factors_of,
     loop_factors,
+    motion_before,
     squared_errors,
     with_factors,
 )
@@ -136,6 +137,37 @@ def test_motions_and_ups_are_those_of_the_keyframes_wherever_these_are_in_a_prob
     assert len(links.keyframes) == 2 and len(levels.keyframes) == 4
     for factors in (links, levels):
         np.testing.assert_allclose(factors.errors(in_problem()), 0.0, atol=1e-9)
+
+
+def driven(retired=(), unmeasured=()):
+    """Return keyframes of a drive, of which some are retired, or not tied to the one before."""
+    motions = [None] + [RelativeMotion(T @ invert(b), COVARIANCE) for b, T in pairwise(DRIVE)]
+    return [
+        SimpleNamespace(
+            motion=None if k in unmeasured else motion, up=None, retired=1 if k in retired else None
+        )
+        for k, motion in enumerate(motions)
+    ]
+
+
+def test_a_link_goes_past_keyframes_that_are_retired():
+    keyframes = driven(retired=(2, 3))
+    before, motion = motion_before(keyframes, 4)
+    assert before == 1
+    np.testing.assert_allclose(motion.T_now_before, DRIVE[4] @ invert(DRIVE[1]), atol=1e-9)
+    # Three motions are less sure than one.
+    assert np.linalg.eigvalsh(motion.covariance - COVARIANCE).min() > 0
+    slot = np.array([0, 1, -1, -1, 2])
+    (links,) = factors_of(keyframes, slot, None)
+    np.testing.assert_array_equal(np.sort(links.keyframes, axis=None), [0, 1, 1, 2])
+    np.testing.assert_allclose(links.errors(DRIVE[slot >= 0]), 0.0, atol=1e-9)
+
+
+def test_a_link_ends_where_the_motion_was_not_measured():
+    assert motion_before(driven(retired=(2, 3), unmeasured=(3,)), 4) == (2, None)
+    assert motion_before(driven(), 0)[1] is None
+    before, motion = motion_before(driven(retired=(0,)), 1)
+    assert before == 0 and motion is not None
 
 
 def test_a_loop_by_the_floor_ties_both_its_keyframes_wherever_they_are_in_a_problem():

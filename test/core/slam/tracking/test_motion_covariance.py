@@ -9,10 +9,12 @@ import pytest
 from sampled_poses import assert_spread, drawn_errors, drawn_poses, twists_from, uneven_covariance
 from stereo_room import planar_pose
 
-from segfloor_ros.core.contracts import LastPose, Mount, RelativeMotion, WheelPose
+from segfloor_ros.core.contracts import NO_POINT, LastPose, Mount, RelativeMotion, WheelPose
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.slam.optional import NoSensors
+from segfloor_ros.core.slam.rig import Observations
+from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.motion import (
     ACCELERATION,
     CameraMotion,
@@ -20,6 +22,7 @@ from segfloor_ros.core.slam.tracking.motion import (
     joined_motion,
 )
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ
+from segfloor_ros.core.slam.tracking.track import ObservedFeatures
 from segfloor_ros.core.twists import se3_exp
 
 MOUNT = Mount(0.45, pitch_rad=0.35, roll_rad=-0.2, forward_m=0.3, left_m=-0.15, yaw_rad=0.4)
@@ -135,3 +138,48 @@ def test_poses_that_are_as_unsure_as_they_say_agree_with_the_wheels(unsure) -> N
     )
     assert agree > 0.99
     assert disagree < 0.1
+
+
+def went_on(sigma_m_s2, sigma_rad_s2, frames):
+    """Return the motion of a camera that speeds up and brakes at random, frame by frame."""
+    rng, motion = np.random.default_rng(9), CameraMotion(40.0, NoSensors())
+    sigma = 0.01 * np.repeat([sigma_m_s2, sigma_rad_s2], 3)
+    step, pose = np.array([0.0, 0.0, 0.1, 0.0, 0.02, 0.0]), np.eye(4)
+    for k in range(frames):
+        motion.take(pose, 1e-12 * np.eye(6), k * STEP_NS)
+        step += rng.normal(0, sigma)
+        pose = se3_exp(step) @ pose
+    return motion
+
+
+@pytest.mark.parametrize(('sigma_m_s2', 'sigma_rad_s2'), [(0.2, 0.5), (6.0, 1.0)])
+def test_how_a_motion_goes_on_is_learnt_from_the_drive(sigma_m_s2, sigma_rad_s2) -> None:
+    """Steps of a drive differ by its accelerations: what is expected next is as unsure as these."""
+    motion = went_on(sigma_m_s2, sigma_rad_s2, 400)
+    for step_s in (0.1, 0.4):
+        expected = motion.expected(399 * STEP_NS + round(step_s * 1e9))
+        sigma = np.sqrt(np.diag(expected.covariance))
+        # Motions are compared over a frame: over s seconds they differ by s².
+        assert sigma[:3] == pytest.approx(sigma_m_s2 * step_s**2, rel=0.5)
+        assert sigma[3:] == pytest.approx(sigma_rad_s2 * step_s**2, rel=0.5)
+
+
+def test_one_surprise_does_not_undo_what_a_drive_has_shown() -> None:
+    motion = went_on(0.2, 0.2, 200)
+    before = motion.expected(200 * STEP_NS).covariance.trace()
+    jump = se3_exp(np.array([0.5, 0.0, 0.0, 0.0, 0.4, 0.0])) @ motion.T_camera_world
+    motion.take(jump, 1e-12 * np.eye(6), 200 * STEP_NS)
+    after = motion.expected(201 * STEP_NS).covariance.trace()
+    assert before < after < 2 * before
+
+
+def test_what_is_new_in_a_keyframe_has_its_error() -> None:
+    features = Features(np.zeros((5, 2)), np.zeros(5, np.uint8), np.zeros((5, 32), np.uint8))
+    uvd = np.full((5, 3), 5.0)
+    uvd[4, 2] = np.nan
+    observations = Observations(uvd, np.ones((5, 3)))
+    ids = np.array([7, NO_POINT, NO_POINT, 9, NO_POINT], np.int32)
+    # Two are known, two are new, and one without a disparity is no point.
+    assert ObservedFeatures(features, observations, ids).known_share == 0.5
+    none = np.full(5, NO_POINT, np.int32)
+    assert ObservedFeatures(features, observations, none).known_share == 0.0
