@@ -48,6 +48,10 @@ def _no_rows(*_: object, **__: object) -> Any:
     return np.zeros(0, np.intp)
 
 
+def _none_aligned(left: Any, observations: Any, rows: Any, *_: object) -> Any:
+    return _nowhere(rows)
+
+
 def _found(front_end: Any, images: Any, features: Any, found: Any, expected: Any) -> Any:
     return found
 
@@ -89,7 +93,9 @@ SLAM: dict[str, Mechanism] = {
     'place keyframes in the local map': Mechanism(
         {'core.slam.tracking.map_tracking.views_near': _no_rows}
     ),
-    'alignment of patches': Mechanism({'core.slam.tracking.map_tracking.align_pixels': _none}),
+    'alignment of patches': Mechanism(
+        {'core.slam.tracking.map_tracking.align_pixels': _none_aligned}
+    ),
     'following between keyframes': Mechanism(
         {'core.slam.tracking.map_tracking.Follower.follow': _none}
     ),
