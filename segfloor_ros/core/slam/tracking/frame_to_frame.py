@@ -51,6 +51,11 @@ class FrameToFrame:
         self._last: tuple[StereoFrame, Images, PoseEstimate] | None = None
         self._seen: tuple[int, Features] | None = None
 
+    @property
+    def stamp_ns(self) -> int | None:
+        """The stamp of the last frame with a pose."""
+        return None if self._last is None else self._last[0].stamp_ns
+
     def reset(self) -> None:
         """Know no frame before."""
         self._last = None
