@@ -2,11 +2,11 @@
 
 A point that should be in view is found with some probability, and then errs by the noise; or what
 is found is something else, which is rare where little is searched, and lies anywhere in that area.
-The logarithm of the likelihood ratio of the two, summed
-over all points and averaged over where the camera may be before it looks (Laplace's
-approximation: MacKay, Information Theory, Inference, and Learning Algorithms, 2003, chapters 22 and
-28), is the evidence for a pose. Where nothing is right, its exponential is 1 on average,
-whatever pose is tried; so it exceeds 1 / p with a probability of at most p (Markov's inequality).
+The logarithm of the likelihood ratio of the two, summed over all points and averaged over the poses
+that the camera may have (Laplace's approximation: MacKay, Information Theory, Inference, and
+Learning Algorithms, 2003, chapters 22 and 28), is the evidence for a pose. Where nothing is right,
+its exponential is 1 on average, whatever pose is tried; so it exceeds 1 / p with a probability of
+at most p (Markov's inequality).
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ class FrameToFrame:
         seen.sigma_px[:, 2] = np.hypot(seen.sigma_px[:, 2], known.sigma_px[:, 2])
         area_px2 = crowded_area_px2(seen.uvd_px[:, :2], self._camera.width * self._camera.height)
         disparity = seen.uvd_px[seen.has_disparity, 2]
-        range_px = float(np.ptp(disparity)) if len(disparity) else None
+        range_px = max(SAME_PX, float(np.ptp(disparity))) if len(disparity) else None
         # What RANSAC takes for right lies within two standard deviations.
         searched = Searched(area_px2, range_px, largest_factor=SAME_PX / (2 * SIGMA_FLOW_PX))
         moved = refine_pose(self._camera, start[0], points, seen, searched=searched, first=start[1])
@@ -135,8 +135,8 @@ class FrameToFrame:
 
 
 def distinct(uv_px: Array) -> NDArray[np.intp]:
-    """Return one row (M,) of pixels (N, 2) for each cell of twice the noise: a corner that is found
-    at several levels of the pyramid counts once.
+    """Return one row (M,) of pixels (N, 2) for each cell of 6 px: a corner that is found at
+    several levels of the pyramid counts once.
     """
     cells = np.floor(uv_px / (1.5 * SAME_PX)).astype(np.intp)
     return np.sort(np.unique(cells, axis=0, return_index=True)[1])
