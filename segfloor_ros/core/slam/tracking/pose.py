@@ -72,8 +72,9 @@ USUAL_SHARE = 0.8
 """Where at least this share of what has a record fits, all is well: to look for a second motion
 costs as much as the pose."""
 
-PROVEN = math.log(PROOF)
-"""Record of what is taken to stand still."""
+PROVEN = math.log(PROOF - 0.5)
+"""Record of what is taken to stand still, halfway to the next lower count: logarithms are rounded
+one way or the other."""
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ def driven(frames, wheels):
     """Return the poses (N, 4, 4) of the base in the map, and those in odom that sensors learn from.
     wheels: poses of the base every 20 ms.
     """
-    slam = equipped_slam(CAMERA, StereoSlamSettings(num_features=300), MOUNT)
+    slam = equipped_slam(CAMERA, StereoSlamSettings(num_features=600), MOUNT)
     slam.rig.offset.estimate = OffsetEstimate(OFFSET_PX, 1e4)
     learnt, learn = [], slam.sensors.learn
 
