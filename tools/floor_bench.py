@@ -31,6 +31,7 @@ from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.contracts import FLOOR
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.whole import read_json
+from segfloor_ros.core.floor.mask.likelihood import Likelihood
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.nodes.configuration import resolve
 from tools.floor_inputs import (
@@ -168,12 +169,16 @@ def _chosen(drives: Sequence[BenchDrive], only: str) -> list[BenchDrive]:
 
 
 def segment(
-    bench: BenchDrive, drive: FloorDrive, configuration: Configuration
+    bench: BenchDrive,
+    drive: FloorDrive,
+    configuration: Configuration,
+    likelihood: Likelihood | None = None,
 ) -> tuple[dict[int, Mask], BenchRow]:
     """Segment all frames of a drive in their order; returns the masks of the scored ones, by index,
     and their figures.
     """
     stage = FloorSegmentation(drive.camera, configuration.floor_segmentation)
+    stage.likelihood = likelihood or stage.likelihood
     masks, rows = {}, []
     start_s = time.thread_time()
     for frame, mask in drive.masks(stage):

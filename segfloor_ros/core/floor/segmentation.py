@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,6 +35,7 @@ from segfloor_ros.core.floor.disparity.matching import (
 )
 from segfloor_ros.core.floor.disparity.profile import (
     BINS_PER_PX,
+    STEP_PX,
     FloorProfile,
     FloorView,
     column_step,
@@ -55,6 +57,7 @@ from segfloor_ros.core.floor.mask.filling import (
     upright_above,
     with_floor,
 )
+from segfloor_ros.core.floor.mask.likelihood import Likelihood, Seen, weighed
 from segfloor_ros.core.floor.mask.pixel_evidence import (
     TEXTURE_WINDOW_PX,
     Comparison,
@@ -104,6 +107,7 @@ class FloorSegmentation:
         self._camera = camera
         self._settings = settings
         self.network = NetworkFloor()
+        self.likelihood = Likelihood()
         self._border = BlankBorder()
         self._mount: Mount | None = None
         self.fixture = Fixture()
@@ -184,10 +188,17 @@ class FloorSegmentation:
             below_said = None if said is None else said[columns]
             if below_said is not None:
                 evidence.mask[below_said == NOT_FLOOR] = NOT_FLOOR
+        with measure('likelihood'):
+            seen = self._seen(
+                view, below, texture / enough, left_rows, heights, compared, noise, evidence.mask
+            )
+            likely = self.likelihood.of(seen)
+            evidence = dataclasses.replace(evidence, mask=weighed(evidence.mask, likely, seen))
         with measure('filling'):
             mask = self._fill(
                 view, profile, below, evidence, left_rows, textured, compared, below_said
             )
+            mask = weighed(mask, likely, seen)
             if not (is_fixed or fit.is_seen):
                 mask[mask == FLOOR] = NO_EVIDENCE
             clear_hidden(mask, moving, columns)
@@ -218,6 +229,34 @@ class FloorSegmentation:
         most = self._matcher.num_disparities
         table = HeightTable.of(view.line, profile, most, self._settings, constant)
         return Heights.of(view, table, below)
+
+    def _seen(
+        self,
+        view: FloorView,
+        below: NDArray[np.float32],
+        texture: NDArray[np.float32],
+        left_rows: NDArray[np.uint8],
+        heights: Heights,
+        compared: Comparison,
+        noise: float,
+        mask: NDArray[np.uint8],
+    ) -> Seen:
+        part = np.s_[::STEP_PX, :: STEP_PX // view.step]
+        index = heights.index[part]
+        above = heights.height[part] - np.float32(self._settings.step_height_m)
+        grey = cv2.blur(left_rows, (5, 5))[::STEP_PX, ::STEP_PX].astype(np.float32)
+        return Seen(
+            first_row=view.first_row,
+            floor_px=compared.floor_px,
+            disparity_px=below[part],
+            slope=view.line.slope,
+            texture=texture[part],
+            overhead=above / heights.table.noise.take(index),
+            grey=grey,
+            costs=compared.costs,
+            noise_grey=noise,
+            is_floor=mask[part] == FLOOR,
+        )
 
     def _observation(
         self,

@@ -43,7 +43,7 @@ COARSE_ABOVE_PX = 28.0
 """Where the floor has a larger disparity, images are matched at half the resolution."""
 _FINE_BLOCK = (9, 9)
 """Columns and rows of the block in which a disparity is refined."""
-_NOISE_SLOPE = 0.03
+NOISE_SLOPE = 0.03
 """Square of the slope between pixels, of the mean of a smoothed pair, that noise of one grey level
 has."""
 _OVERLAP_PX = 4
@@ -199,7 +199,7 @@ def refined(
     count, by_slope = np.maximum(in_block(known), 1), in_block(slope)
     power = np.maximum(in_block(squared), 1e-3)
     # Noise has slopes, too: they are no information.
-    noise = count * _NOISE_SLOPE * noise_grey**2
+    noise = count * NOISE_SLOPE * noise_grey**2
     information = np.maximum(power - by_slope**2 / count - noise, 1e-3)
     shift = (in_block(slope * step) - by_slope * in_block(step) / count) / information
     matched = in_block(squared * disparity) / power

@@ -32,6 +32,7 @@ from segfloor_ros.core.floor.disparity.matching import (
     SIGMAS,
 )
 from segfloor_ros.core.floor.disparity.profile import STEP_PX, FloorLine, FloorProfile, FloorView
+from segfloor_ros.core.floor.mask.likelihood import Costs
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
 _MIN_DISPARITY_PX = 2.5
@@ -92,6 +93,7 @@ class Comparison:
     denied: NDArray[np.bool_]
     unlike: NDArray[np.bool_]
     consistent: NDArray[np.bool_]
+    costs: Costs | None = None
 
 
 @dataclass(frozen=True)
@@ -375,7 +377,8 @@ def compare(
     contrary |= floor > 2 * _LIKENESS_GREY + _NOISE_SHARE * noise_grey
     contradicted = (against, denied, unlike)
     masks = (*(mask & reached for mask in contradicted), ~(contrary & reached))
-    return Comparison(floor_px, *(_enlarged(mask, disparity.shape) for mask in masks))
+    costs = Costs(floor, matched, reached.astype(np.float32))
+    return Comparison(floor_px, *(_enlarged(mask, disparity.shape) for mask in masks), costs)
 
 
 def compare_measured(

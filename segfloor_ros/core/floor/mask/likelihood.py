@@ -1,0 +1,400 @@
+"""How likely each pixel is floor: one log-likelihood ratio of all that is known of it.
+
+A feature is a physical quantity over what it errs by, so that its weight holds for all cameras. The
+weights are those of a logistic regression on pixels whose truth is known, as many of floor as of
+anything else, whole recordings held out: `tools/fit_floor.py` makes them.
+
+What a pixel shows by itself is passed on along the image, as far as that looks alike: a pixel that
+says little is as likely floor as those around it. Gastal and Oliveira, Domain Transform for
+Edge-Aware Image and Video Processing (2011), the recursive filter.
+
+All pictures here are of half the resolution of the image, (h, w) float32.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE
+from segfloor_ros.core.floor.disparity.matching import NOISE_PX, NOISE_SLOPE, SAME_PX, SIGMAS
+from segfloor_ros.core.floor.disparity.profile import STEP_PX
+
+Picture = NDArray[np.float32]
+
+WEIGHTS = {
+    'one': 0.71,
+    'above': -0.07,
+    'below': 0.31,
+    'rises': 0.94,
+    'steep': -1.28,
+    'on': 2.22,
+    'off': -0.86,
+    'matched': -1.21,
+    'cost': -0.66,
+    'overhead': -0.35,
+    'look': 0.56,
+    'dark': -0.44,
+    'bright': -1.52,
+    'shared': -0.17,
+}
+"""By feature, made by `tools/fit_floor.py`.
+
+one: of a pixel that shows nothing. above, below: by how many sigmas it is higher, lower, than the
+floor around it. rises, steep: log ratio of likelihoods that the disparity rises down the image as
+a floor's, or as that of what is upright. on, off: share of what is around it that is on that floor,
+less that which is off. matched: log ratio of the difference of both images on the floor to that at
+the matched disparity. cost: the first of these over the noise. overhead: by how many sigmas it is
+higher than what a robot climbs. look: log ratio of how likely its brightness is of the floor to how
+often it is seen. dark, bright: by how many sigmas more than two it is darker, brighter, than the
+floor. shared: whether the right camera sees it.
+"""
+
+PASSED_ON = 0.27, 0.8, 1.76
+"""What a pixel has of itself, and of what is passed on to it: a constant, and weights."""
+
+FLOOR_NAT, STANDS_NAT = math.log(0.95 / 0.05), 0.0
+"""From the first on a pixel is floor, whatever the rules say; what is less likely than the second
+is none. Natural logarithms of odds."""
+
+_LOCAL, _ROUNDS = (31, 15), 3
+"""Columns and rows of the window in which the floor around a pixel is measured, and how often."""
+_NOTHING = 0.02
+"""So small a share of a window tells nothing."""
+_LEAST_KNOWN = 0.2
+_LEAST_PIXELS = 100
+_NEAR, _WIDE = (5, 5), (9, 9)
+_MOST_SIGMAS, _MOST_NATS = 12.0, 6.0
+"""No feature says more: what is wrong is then as wrong as it can be."""
+_UNEVEN = 0.7, 2.8
+"""How uneven floors are, in sigmas of a disparity, at least and at most."""
+_RISE_SIGMA_PX = 0.7, 2.0
+"""Error of the difference of two disparities, at least and at most."""
+_UNEQUAL_GREY = 0.8, 0.3
+"""Mean difference of both images of the same thing: so many sigmas of noise, and grey levels."""
+
+_SAMPLED, _FITS, _LEAST_SAMPLES = 4, 4, 20
+"""Every such row and column, one independent of the other, tells how light falls on the floor; so
+often it is asked; of fewer it is not known."""
+_DIRT = 0.1
+"""By such a share of its brightness a floor varies: dust, wear."""
+_FLAT = np.diag(np.array([1e-6, 1e-6, 1e-6, 1e-3, 1e-3, 1e-3], np.float32))
+_BINS, _END = 2, 10
+"""Of the histogram of brightness, per sigma of the floor's; it ends at so many sigmas."""
+_FAR, _LOOK_NATS = 5.0, (-4.0, 3.0)
+_MOST_ALONE = 8.0
+"""Bounds of what a look says, and of what a pixel says by itself."""
+
+_REACH_PX = 15.0
+"""So far a pixel passes on what it knows, where nothing borders."""
+_DARK_GREY = 8.0
+"""Differences of grey levels count as shares of grey levels this much brighter."""
+_LEAST_EDGE = 0.02
+_EDGES = 2.0
+"""Differences that are larger, in medians of those on the floor, border."""
+
+
+@dataclass(frozen=True)
+class Costs:
+    """How much both images differ around each pixel, grey levels: were it floor, and as matched.
+    reached: 1 where the right camera sees the floor, else 0.
+    """
+
+    floor: Picture
+    matched: Picture
+    reached: Picture
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What is known of each pixel.
+
+    first_row: of the image. floor_px, disparity_px: disparity of the floor, and the matched one, 0 where none is. slope: of
+    a floor's disparity, per row of the image. texture: as many times of what is surely no noise.
+    overhead: by how many sigmas it is higher than what a robot climbs. grey: brightness, smoothed.
+    costs: None of a depth camera. noise_grey: of the images. is_floor: bool, what is floor so far.
+    """
+
+    first_row: int
+    floor_px: Picture
+    disparity_px: Picture
+    slope: float
+    texture: Picture
+    overhead: Picture
+    grey: Picture
+    costs: Costs | None
+    noise_grey: float
+    is_floor: NDArray[np.bool_]
+
+
+def features(seen: Seen) -> Picture:
+    """Return the features (F, h, w) of all pixels, in the order of `WEIGHTS`."""
+    known = (seen.disparity_px > 0).astype(np.float32)
+    weight = np.clip(2 * seen.texture - 1, 0, 1) * _certainty(seen) * known
+    one = np.ones_like(known)
+    height, mostly_on = _local_height(seen, weight, known)
+    rises = _rise(seen, weight, known)
+    # What is as level as a floor is none where it is higher.
+    rises = np.where(rises > 0, rises * np.exp(-(height**2) / 8), rises)
+    matched, cost, reached = _compared(seen, known)
+    overhead = np.clip(np.nan_to_num(seen.overhead), 0, _MOST_NATS) * weight
+    look, dark, bright = _look(seen.grey, seen.is_floor)
+    signed = [part for both in (height, rises, mostly_on) for part in _halves(both)]
+    return np.stack([one, *signed, matched, cost, overhead, look, dark, bright, reached])
+
+
+def _halves(values: Picture) -> tuple[Picture, Picture]:
+    """Return what is positive, and what is negative, both positive."""
+    return np.maximum(values, 0), np.maximum(-values, 0)
+
+
+def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, float]) -> np.float32:
+    """Return the standard deviation of some values by their median; the least where they are few.
+    """
+    some = values[where]
+    spread = 1.4826 * float(np.median(np.abs(some))) if len(some) > _LEAST_PIXELS else 0.0
+    return np.float32(np.clip(spread, *bounds))
+
+
+def _mean(values: Picture, known: Picture, size: tuple[int, int]) -> Picture:
+    """Return the sum of values around each pixel over how much is known there."""
+    share = cv2.blur(known, size)
+    mean: Picture = cv2.blur(values, size) / np.maximum(share, np.float32(_LEAST_KNOWN))
+    return mean
+
+
+def _certainty(seen: Seen) -> Picture | np.float32:
+    """Return how well disparities are known, 1 where as well as they can be: the bound of Cramer
+    and Rao of what the block around a pixel shows.
+    """
+    if seen.costs is None:
+        return np.float32(1)
+    slope = cv2.Sobel(seen.grey, cv2.CV_32F, 1, 0, ksize=1, scale=1 / (2 * STEP_PX))
+    pixels = _NEAR[0] * _NEAR[1]
+    power = cv2.boxFilter(slope * slope, -1, _NEAR, normalize=False)
+    power -= np.float32(pixels * NOISE_SLOPE * seen.noise_grey**2)
+    variance = np.float32(2 * seen.noise_grey**2) / np.maximum(power, np.float32(1e-3))
+    certainty: Picture = np.float32(NOISE_PX) / np.sqrt(np.float32(NOISE_PX**2) + variance)
+    return certainty
+
+
+def _local_height(seen: Seen, weight: Picture, known: Picture) -> tuple[Picture, Picture]:
+    """Return how high pixels are above the floor around them, in sigmas, and which share around
+    each is on it, less that which is off it.
+
+    The profile may lie above the ground beside a stone: at first what is lower counts as floor, but
+    nothing that is higher.
+    """
+    above = np.clip((seen.disparity_px - seen.floor_px) / np.float32(NOISE_PX), -60, 60) * known
+    floor, lowest = np.zeros_like(above), -60.0
+    for _ in range(_ROUNDS):
+        gap = above - floor
+        on = weight * ((gap < SIGMAS * 1.5) & (gap > lowest))
+        floor = cv2.blur(on * above, _LOCAL) / (cv2.blur(on, _LOCAL) + np.float32(_NOTHING))
+        lowest = -SIGMAS * 1.5
+    smooth = _mean(above, known, _NEAR) - floor
+    even = (weight > _LEAST_KNOWN) & (np.abs(smooth) < 3 * SIGMAS)
+    height = (above - floor) / _spread(smooth, even, _UNEVEN)
+    bounded = np.clip(height, -_MOST_SIGMAS, _MOST_SIGMAS) * weight
+    on_off = np.where(np.abs(height) < SIGMAS, weight, -weight)
+    return _mean(bounded, known, _NEAR) * known, _mean(on_off, known, _WIDE)
+
+
+def _rise(seen: Seen, weight: Picture, known: Picture) -> Picture:
+    """Return the log ratio of the likelihoods that disparities rise down the image as those of a
+    floor and that they do not, as those of what is upright.
+
+    They are compared over as many rows as it takes a floor to rise by more than noise.
+    """
+    rows = math.ceil(SAME_PX / seen.slope / STEP_PX)
+    rows = max(1, min(rows, (len(known) - 1) // 2))
+    far, near = np.s_[: -2 * rows], np.s_[2 * rows :]
+    rise = seen.disparity_px[near] - seen.disparity_px[far]
+    of_floor = seen.floor_px[near] - seen.floor_px[far]
+    both = weight[rows:-rows] * known[near] * known[far]
+    off = rise - of_floor
+    sigma = _spread(off, (both > _LEAST_KNOWN) & (np.abs(off) < 4 * SAME_PX), _RISE_SIGMA_PX)
+    ratio = np.zeros_like(known)
+    nats = of_floor * (2 * rise - of_floor) / (2 * sigma**2)
+    ratio[rows:-rows] = np.clip(nats, -_MOST_NATS, _MOST_NATS) * both
+    return _mean(ratio, known, _NEAR)
+
+
+def _compared(seen: Seen, known: Picture) -> tuple[Picture, Picture, Picture]:
+    """Return what the images say: the log ratio of their difference on the floor to that at the
+    matched disparity, how much the first is more than noise, and where they say anything.
+    """
+    if seen.costs is None:
+        return np.zeros_like(known), np.zeros_like(known), np.ones_like(known)
+    costs, (sigmas, grey) = seen.costs, _UNEQUAL_GREY
+    noise = np.float32(sigmas * seen.noise_grey + grey)
+    best = np.minimum(costs.matched, costs.floor)
+    ratio = np.log((costs.floor + noise) / (best + noise)) * known * costs.reached
+    more = np.clip(costs.floor / noise - 1, 0, _MOST_NATS) * costs.reached
+    return ratio, more, costs.reached
+
+
+def _look(grey: Picture, is_floor: NDArray[np.bool_]) -> tuple[Picture, Picture, Picture]:
+    """Return the log ratio of how likely the brightness of each pixel is of the floor to how often
+    one so far from the floor's is seen, and by how many sigmas more than two it is darker, and
+    brighter.
+
+    A sun, a lamp, a lens and dust change the floor's brightness slowly: its logarithm is taken for
+    a quadratic of row and column. It is fitted again without what stood out.
+    """
+    brightness = cv2.log(grey + 1)
+    part = np.s_[::_SAMPLED, ::_SAMPLED]
+    y, x = (np.linspace(-1, 1, size, dtype=np.float32) for size in grey.shape)
+    at = [axis[part] for axis in np.meshgrid(x, y)]
+    terms, seen = _quadratic(*at), brightness[part]
+    on = np.flatnonzero(is_floor[part])
+    if len(on) < _LEAST_SAMPLES:
+        return np.zeros_like(grey), np.zeros_like(grey), np.zeros_like(grey)
+    of_floor, seen = terms[:, on], seen.ravel()[on]
+    counted = np.ones(len(on), np.float32)
+    for _ in range(_FITS):
+        weighted = of_floor * (counted / counted.sum())
+        # A few pixels do not tell how it bends.
+        bends = weighted @ of_floor.T + _FLAT
+        light = np.linalg.solve(bends, weighted @ seen)
+        squares = (seen - light @ of_floor) ** 2
+        variance = float(squares @ counted) / float(counted.sum()) + _DIRT**2
+        counted = (squares < SIGMAS**2 * variance).astype(np.float32)
+    unsure = 1 + np.einsum('an,an->n', terms, np.linalg.solve(bends, terms)) / counted.sum()
+    size = grey.shape[::-1]
+    of_light = cv2.resize(unsure.reshape(at[0].shape).astype(np.float32), size)
+    # Grey levels are whole: no surface is known better.
+    deviation = np.sqrt(variance * of_light + 1 / (grey + 1) ** 2)
+    sigmas = (brightness - _expected(light, x, y)) / deviation
+    bins = np.clip(sigmas * _BINS + _END * _BINS + 0.5, 0, 2 * _END * _BINS).astype(np.intp)
+    often = np.bincount(bins[::2, ::2].ravel(), minlength=2 * _END * _BINS + 1) + 1.0
+    often = np.convolve(often, (0.25, 0.5, 0.25), 'same')
+    log_often = np.log(often * (_BINS / often.sum())).astype(np.float32)
+    by_look = -0.5 * sigmas**2 - np.float32(0.5 * math.log(2 * math.pi)) - log_often[bins]
+    dark, bright = np.clip(-sigmas - SIGMAS, 0, _FAR), np.clip(sigmas - SIGMAS, 0, _FAR)
+    return np.clip(by_look, *_LOOK_NATS), dark, bright
+
+
+def _quadratic(x: Picture, y: Picture) -> Picture:
+    """Return the terms (6, N) of a quadratic of places (N,)."""
+    x, y = x.ravel(), y.ravel()
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+
+
+def _expected(light: Picture, x: Picture, y: Picture) -> Picture:
+    """Return the values (len(y), len(x)) of a quadratic."""
+    one, across, down, across2, both, down2 = light.astype(np.float32)
+    by_row = (one + down * y + down2 * y * y)[:, None]
+    values: Picture = by_row + (across + both * y)[:, None] * x + across2 * x * x
+    return values
+
+
+def _kept(difference: Picture, edge: np.float32) -> Picture:
+    """Return the share of what a pixel knows that its neighbour gets."""
+    kept: Picture = np.exp(-math.sqrt(2) * (1 / _REACH_PX + np.maximum(difference / edge - 0.5, 0)))
+    return kept.astype(np.float32)
+
+
+def _along(values: Picture, kept: Picture) -> Picture:
+    """Return values (N, 2, m) passed on along the first axis, forth and back. kept: (N - 1, m)."""
+    values, kept = np.ascontiguousarray(values), np.ascontiguousarray(kept)
+    for i in range(1, len(values)):
+        values[i] += kept[i - 1] * (values[i - 1] - values[i])
+    for i in range(len(values) - 2, -1, -1):
+        values[i] += kept[i] * (values[i + 1] - values[i])
+    return values
+
+
+def passed_on(alone: Picture, grey: Picture, noise_grey: float) -> Picture:
+    """Return what the pixels around each one say of the floor, (h, w), as far as it is unsure.
+    alone: the log-likelihood ratio of each by itself. grey: smoothed.
+    """
+    certain = np.abs(np.tanh(alone / 2))
+    brightness = cv2.log(grey + _DARK_GREY)
+    across, down = (np.abs(np.diff(brightness, axis=axis)) for axis in (1, 0))
+    is_floor = alone > SIGMAS
+    inside = is_floor[:, 1:] & is_floor[:, :-1]
+    usual = 1.4826 * float(np.median(across[inside])) if inside.any() else 0.0
+    noise = 0.15 * noise_grey / (float(np.median(grey)) + _DARK_GREY)
+    edge = np.float32(_EDGES * math.hypot(max(_LEAST_EDGE, usual), noise))
+    said = np.stack([alone * certain, certain]).astype(np.float32)
+    said = _along(said.transpose(2, 0, 1), _kept(across, edge).T)
+    said = _along(said.transpose(2, 1, 0), _kept(down, edge))
+    around = said[:, 0] / (said[:, 1] + np.float32(_NOTHING))
+    unsure: Picture = (1 - certain) * around
+    return unsure
+
+
+def _kept(difference: Picture, edge: np.float32) -> Picture:
+    """Return the share of what a pixel knows that its neighbour gets."""
+    kept: Picture = np.exp(-math.sqrt(2) * (1 / _REACH_PX + np.maximum(difference / edge - 0.5, 0)))
+    return kept.astype(np.float32)
+
+
+def _along(values: Picture, kept: Picture) -> Picture:
+    """Return values (N, 2, m) passed on along the first axis, forth and back. kept: (N - 1, m)."""
+    values, kept = np.ascontiguousarray(values), np.ascontiguousarray(kept)
+    for i in range(1, len(values)):
+        values[i] += kept[i - 1] * (values[i - 1] - values[i])
+    for i in range(len(values) - 2, -1, -1):
+        values[i] += kept[i] * (values[i + 1] - values[i])
+    return values
+
+
+@dataclass(frozen=True)
+class Likely:
+    """Log-likelihood ratios of floor: of each pixel by itself, and with what is around it."""
+
+    alone: Picture
+    together: Picture
+
+
+class Likelihood:
+    """Finds how likely the pixels of a frame are floor. weights: of the features, (F,).
+    combined: (3,), as `PASSED_ON`.
+    """
+
+    def __init__(
+        self,
+        weights: Sequence[float] = tuple(WEIGHTS.values()),
+        combined: Sequence[float] = PASSED_ON,
+    ) -> None:
+        self.weights = np.array(weights, np.float32)
+        self.combined = np.array(combined, np.float32)
+
+    def of(self, seen: Seen) -> Likely:
+        """Return how likely each pixel is floor; what is about as far as the horizon is not."""
+        alone = self.alone(features(seen))
+        alone = np.where(seen.floor_px > SAME_PX, alone, np.float32(-_MOST_ALONE))
+        constant, own, weight = self.combined
+        around = passed_on(alone, seen.grey, seen.noise_grey)
+        return Likely(alone, constant + own * alone + weight * around)
+
+    def alone(self, parts: Picture) -> Picture:
+        """Return the log-likelihood ratio of floor of pixels by their features (F, ...) alone."""
+        ratio: Picture = np.tensordot(self.weights, parts, 1)
+        return np.clip(ratio, -_MOST_ALONE, _MOST_ALONE)
+
+
+VETO,ADD,ALONE,UNREACHED=-0.5,2.94,0.0,1.0
+
+
+def weighed(mask: NDArray[np.uint8], likely: Likely, seen: Seen) -> NDArray[np.uint8]:
+    """Return a mask (R, W) where what is not likely floor is none, and what is surely floor is."""
+    reached = seen.costs.reached if seen.costs is not None else np.ones_like(seen.grey)
+    unlikely = np.where(reached > 0, likely.alone < VETO, likely.together < UNREACHED)
+    sure = (likely.together > ADD) & (likely.alone > ALONE)
+    size = mask.shape[1], mask.shape[0]
+    unlikely, sure = (
+        cv2.resize(part.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        for part in (unlikely, sure)
+    )
+    found = mask.copy()
+    found[(mask == FLOOR) & unlikely] = NO_EVIDENCE
+    found[(mask == NO_EVIDENCE) & sure] = FLOOR
+    return found
