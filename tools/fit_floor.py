@@ -176,7 +176,9 @@ def fit_floor(
     benches = bench_drives(data.resolve())
     outlined = {one.name for one in benches if one.group == OUTLINED}
     with announcing() as announce:
-        drives = {one.name: floor_drive(one, cache.expanduser(), False, announce) for one in benches}
+        drives = {
+            one.name: floor_drive(one, cache.expanduser(), False, announce) for one in benches
+        }
     frames = {name: scored_frames(drive, configuration, rng) for name, drive in drives.items()}
     of_all = fitted(frames, outlined)
     for name, weight in zip(WEIGHTS, of_all.weights, strict=True):

@@ -163,7 +163,7 @@ def run_command(command: Callable[..., None]) -> None:
 
 def with_optional_values(words: list[str]) -> list[str]:
     """Return the words of a command line with `--view=` for a `--view` without a file."""
-    files = [*words[1:], '']
+    files = [*words, ''][1:]
     pairs = zip(words, files, strict=True)
     return ['--view=' if w == '--view' and not f.endswith(SUFFIX) else w for w, f in pairs]
 

@@ -49,15 +49,19 @@ from segfloor_ros.core.floor.mask.filling import (
     NetworkFloor,
     beside_something,
     blank_feet,
-    drop_islands,
     fill_gaps,
     fill_regions,
     image_slope,
     trim_to_edges,
     upright_above,
-    with_floor,
 )
-from segfloor_ros.core.floor.mask.likelihood import Likelihood, Seen, weighed
+from segfloor_ros.core.floor.mask.likelihood import (
+    Likelihood,
+    Seen,
+    weighed,
+    with_floor,
+    without_floor,
+)
 from segfloor_ros.core.floor.mask.pixel_evidence import (
     TEXTURE_WINDOW_PX,
     Comparison,
@@ -181,9 +185,7 @@ class FloorSegmentation:
                 compared = compare_measured(view, profile, below, on_floor, NOISE_PX)
         with measure('evidence'):
             left_view = left[columns]
-            evidence = _evidence(
-                view, below, left_view, texture, enough, compared, heights, self._settings
-            )
+            evidence = _evidence(view, below, left_view, texture, enough, compared, heights)
             clear_hidden(evidence.mask, moving, columns)
             below_said = None if said is None else said[columns]
             if below_said is not None:
@@ -193,12 +195,14 @@ class FloorSegmentation:
                 view, below, texture / enough, left_rows, heights, compared, noise, evidence.mask
             )
             likely = self.likelihood.of(seen)
-            evidence = dataclasses.replace(evidence, mask=weighed(evidence.mask, likely, seen))
+            evidence = dataclasses.replace(
+                evidence, mask=weighed(evidence.mask, likely, seen.floor_px)
+            )
         with measure('filling'):
             mask = self._fill(
                 view, profile, below, evidence, left_rows, textured, compared, below_said
             )
-            mask = weighed(mask, likely, seen)
+            mask = weighed(mask, likely, seen.floor_px)
             if not (is_fixed or fit.is_seen):
                 mask[mask == FLOOR] = NO_EVIDENCE
             clear_hidden(mask, moving, columns)
@@ -322,30 +326,27 @@ class FloorSegmentation:
         said: NDArray[np.uint8] | None,
     ) -> NDArray[np.uint8]:
         """Return the mask with floor where this pair of images alone cannot tell: where it looks
-        like floor. The more floor is known the better is known how it looks, so this is done twice,
-        and what then does not look like it is floor only if it was measured. Nor does it contradict
-        a network that was right so far.
+        like floor. What then does not look like it is floor only if it was measured. Nor does it
+        contradict a network that was right so far.
         """
         mask, odd = evidence.mask, evidence.odd
         beside = beside_something(view, mask)
         left = np.ascontiguousarray(left_rows[:, :: view.step])
         slope = image_slope(left_rows)
         upright_px = upright_above(view, disparity, compared, textured)
-        for _ in range(2):
-            mask = fill_regions(
-                view, mask, slope, upright_px, compared, textured, evidence.standing, beside, odd
-            )
-            may_be = compared.consistent & ~compared.denied & ~(beside | odd)
-            mask = fill_gaps(view, profile, mask, may_be)
-            unlike = unlike_floor(left, mask == FLOOR)
-            odd = unlike & (evidence.off | evidence.odd)
-            mask[unlike & evidence.off & textured & (mask == FLOOR)] = NO_EVIDENCE
+        mask = fill_regions(
+            view, mask, slope, upright_px, compared, textured, evidence.standing, beside, odd
+        )
+        may_be = compared.consistent & ~compared.denied & ~(beside | odd)
+        mask = fill_gaps(view, profile, mask, may_be)
+        unlike = unlike_floor(left, mask == FLOOR)
+        mask = without_floor(mask, unlike & evidence.off & textured)
         if said is not None:
             self.network.note(said, mask)
         if said is not None and self.network.is_trusted:
             undenied = compared.consistent & ~compared.denied
             mask = with_floor(mask, (said == FLOOR) & undenied)
-        return drop_islands(mask)
+        return mask
 
     def _scan(
         self,
@@ -394,12 +395,11 @@ def _evidence(
     enough: float,
     compared: Comparison,
     heights: Heights,
-    settings: FloorSegmentationSettings,
 ) -> Evidence:
     """Return what the pixels (R, W) of the view say by themselves, cut back to edges, and left
     open where they do not look like floor and are not measured to lie on it.
     """
-    mask = judge(view, below, texture > enough, compared, heights, settings)
+    mask = judge(view, below, texture > enough, compared, heights)
     seen = trim_to_edges(mask, row_slope(left), TEXTURE_WINDOW_PX // 2 + 3)
     odd, sigmas = unlike_floor(left, seen == FLOOR), mean_height(heights)
     off, standing = np.abs(sigmas) > SIGMAS * MEAN_NOISE, sigmas > SIGMAS

@@ -26,6 +26,7 @@ from segfloor_ros.core.floor.disparity.profile import (
     pixels_where,
     surface_above,
 )
+from segfloor_ros.core.floor.mask.likelihood import enlarged, with_floor
 from segfloor_ros.core.floor.mask.pixel_evidence import EDGE_SLOPE, Comparison, below_floor
 
 _MIN_REGION_PX = 15
@@ -33,8 +34,6 @@ _MIN_COLUMNS = 0.3
 """Part of the columns of a region that must show floor for it to be filled."""
 _GAP_M = 0.5
 """Gaps of this size between floor pixels are filled where nothing speaks against it."""
-_ISLAND_SHARE = 0.05
-"""Patches of floor smaller than this share of the largest are dropped."""
 _MIN_SLOPE = 1.5
 """Grey levels per pixel at half resolution; weaker edges bound no region."""
 _STRONG_SLOPE = 10.0
@@ -107,11 +106,11 @@ def fill_regions(
     nearer = (rows >= highest) & (not_blank > 0) & ~standing[part]
     fill = inside & (nearer | _next_to_floor(small))
     fill &= ~(beside | odd)[part]
-    mask = with_floor(mask, _enlarged(fill, mask))
+    mask = with_floor(mask, enlarged(fill, mask))
     # Light on the floor is no border, where both ends of a stretch are known.
     no_border = agreed & (slope < _STRONG_SLOPE)
     to_contact = fill_to_contact(view, mask, no_border, ~odd[part], upright_px, compared)
-    return with_floor(mask, _enlarged(to_contact, mask))
+    return with_floor(mask, enlarged(to_contact, mask))
 
 
 def image_slope(image: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -176,17 +175,6 @@ def beside_something(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.boo
     return (view.columns < floor_px) & (near == 0)
 
 
-def with_floor(mask: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Return the mask (R, W) with floor where nothing is known and `where` (R, W) is set."""
-    change = (mask == NO_EVIDENCE) & where
-    return mask ^ (change.view(np.uint8) * np.uint8(NO_EVIDENCE ^ FLOOR))
-
-
-def _enlarged(picture: NDArray[np.bool_], mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    size = (mask.shape[1], mask.shape[0])
-    return cv2.resize(picture.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-
-
 def fill_gaps(
     view: FloorView, profile: FloorProfile, mask: NDArray[np.uint8], consistent: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
@@ -203,21 +191,6 @@ def fill_gaps(
     between &= (gaps.after(mask, NO_EVIDENCE) == FLOOR) | at_border
     across = np.minimum(gaps.stop, width - 1) - gaps.first + 1
     return with_floor(mask, gaps.painted(between & (across <= longest[gaps.row])) & consistent)
-
-
-def drop_islands(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the mask without patches of floor smaller than a share of the largest."""
-    step = STEP_PX
-    small = (mask[::step, ::step] == FLOOR).astype(np.uint8)
-    count, label, stats, _ = cv2.connectedComponentsWithStats(small, connectivity=8)
-    if count < 3:
-        return mask
-    area = stats[:, cv2.CC_STAT_AREA]
-    is_lone = area < _ISLAND_SHARE * area[1:].max()
-    if not is_lone.any():
-        return mask
-    lone = _enlarged(is_lone[label], mask) & (mask == FLOOR)
-    return mask ^ (lone.view(np.uint8) * np.uint8(NO_EVIDENCE ^ FLOOR))
 
 
 def trim_to_edges(

@@ -28,20 +28,20 @@ from segfloor_ros.core.floor.disparity.profile import STEP_PX
 Picture = NDArray[np.float32]
 
 WEIGHTS = {
-    'one': 0.71,
-    'above': -0.07,
-    'below': 0.31,
-    'rises': 0.94,
-    'steep': -1.28,
-    'on': 2.22,
-    'off': -0.86,
-    'matched': -1.21,
-    'cost': -0.66,
-    'overhead': -0.35,
-    'look': 0.56,
-    'dark': -0.44,
-    'bright': -1.52,
-    'shared': -0.17,
+    'one': 0.72,
+    'above': -0.05,
+    'below': 0.37,
+    'rises': 1.06,
+    'steep': -1.52,
+    'on': 2.37,
+    'off': -1.00,
+    'matched': -2.16,
+    'cost': -0.11,
+    'overhead': -0.32,
+    'look': 0.62,
+    'dark': -0.30,
+    'bright': -1.40,
+    'shared': -0.26,
 }
 """By feature, made by `tools/fit_floor.py`.
 
@@ -55,12 +55,14 @@ often it is seen. dark, bright: by how many sigmas more than two it is darker, b
 floor. shared: whether the right camera sees it.
 """
 
-PASSED_ON = 0.27, 0.8, 1.76
+PASSED_ON = 0.44, 0.83, 1.61
 """What a pixel has of itself, and of what is passed on to it: a constant, and weights."""
 
-FLOOR_NAT, STANDS_NAT = math.log(0.95 / 0.05), 0.0
-"""From the first on a pixel is floor, whatever the rules say; what is less likely than the second
-is none. Natural logarithms of odds."""
+_SURE, _UNLIKELY = math.log(0.95 / 0.05), math.log(0.4 / 0.6)
+"""What is floor with more than the first probability is floor; by itself with less than the second
+it is none."""
+LEAST_FLOOR_PX = 2.5
+"""Farther floor, of smaller disparity, is not judged."""
 
 _LOCAL, _ROUNDS = (31, 15), 3
 """Columns and rows of the window in which the floor around a pixel is measured, and how often."""
@@ -154,8 +156,7 @@ def _halves(values: Picture) -> tuple[Picture, Picture]:
 
 
 def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, float]) -> np.float32:
-    """Return the standard deviation of some values by their median; the least where they are few.
-    """
+    """Return the standard deviation of some values by their median; the least where they are few."""
     some = values[where]
     spread = 1.4826 * float(np.median(np.abs(some))) if len(some) > _LEAST_PIXELS else 0.0
     return np.float32(np.clip(spread, *bounds))
@@ -381,20 +382,31 @@ class Likelihood:
         return np.clip(ratio, -_MOST_ALONE, _MOST_ALONE)
 
 
-VETO,ADD,ALONE,UNREACHED=-0.5,2.94,0.0,1.0
+def weighed(mask: NDArray[np.uint8], likely: Likely, floor_px: Picture) -> NDArray[np.uint8]:
+    """Return a mask (R, W) without floor that is not likely, and with what is surely floor. It is
+    unlikely where neither the pixel by itself nor what is around it speaks for it; and where
+    nothing is known it is sure where both do.
+    """
+    unlikely = (likely.alone < _UNLIKELY) & (likely.together < 0)
+    sure = (likely.together > _SURE) & (likely.alone > 0) & (floor_px > LEAST_FLOOR_PX)
+    return with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))
 
 
-def weighed(mask: NDArray[np.uint8], likely: Likely, seen: Seen) -> NDArray[np.uint8]:
-    """Return a mask (R, W) where what is not likely floor is none, and what is surely floor is."""
-    reached = seen.costs.reached if seen.costs is not None else np.ones_like(seen.grey)
-    unlikely = np.where(reached > 0, likely.alone < VETO, likely.together < UNREACHED)
-    sure = (likely.together > ADD) & (likely.alone > ALONE)
-    size = mask.shape[1], mask.shape[0]
-    unlikely, sure = (
-        cv2.resize(part.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-        for part in (unlikely, sure)
-    )
-    found = mask.copy()
-    found[(mask == FLOOR) & unlikely] = NO_EVIDENCE
-    found[(mask == NO_EVIDENCE) & sure] = FLOOR
-    return found
+def with_floor(mask: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return the mask (R, W) with floor where nothing is known and `where` (R, W) is set."""
+    return _changed(mask, (mask == NO_EVIDENCE) & where)
+
+
+def without_floor(mask: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return the mask (R, W) with nothing known where it is floor and `where` (R, W) is set."""
+    return _changed(mask, (mask == FLOOR) & where)
+
+
+def _changed(mask: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    return mask ^ (where.view(np.uint8) * np.uint8(NO_EVIDENCE ^ FLOOR))
+
+
+def enlarged(picture: NDArray[np.bool_], mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return a picture of half the resolution (h, w) in the size of a mask (R, W)."""
+    size = (mask.shape[1], mask.shape[0])
+    return cv2.resize(picture.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0

@@ -32,11 +32,9 @@ from segfloor_ros.core.floor.disparity.matching import (
     SIGMAS,
 )
 from segfloor_ros.core.floor.disparity.profile import STEP_PX, FloorLine, FloorProfile, FloorView
-from segfloor_ros.core.floor.mask.likelihood import Costs
+from segfloor_ros.core.floor.mask.likelihood import LEAST_FLOOR_PX, Costs, enlarged
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
-_MIN_DISPARITY_PX = 2.5
-"""Farther floor is not judged."""
 _CONTACT_HEIGHT_M = 0.12
 """Up to this height an upright surface is taken to stand on the floor below it."""
 
@@ -181,7 +179,6 @@ def judge(
     textured: NDArray[np.bool_],
     compared: Comparison,
     heights: Heights,
-    settings: FloorSegmentationSettings,
 ) -> NDArray[np.uint8]:
     """Return what the pixels (R, W) of the view say by themselves, the mask of `Evidence`.
 
@@ -191,7 +188,7 @@ def judge(
     table, above, off = heights.table, heights.above, heights.off
     # What seems to lie below the floor may be what the floor mirrors.
     sure = (textured & compared.against) | (compared.denied & above)
-    near = disparity >= np.float32(_MIN_DISPARITY_PX)
+    near = disparity >= np.float32(LEAST_FLOOR_PX)
     may_be = textured & near & ~off
     mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
     mask[may_be & ~(compared.against | compared.unlike)] = FLOOR
@@ -200,11 +197,6 @@ def judge(
     low = above & sure & (heights.height < up + np.float32(_CONTACT_HEIGHT_M))
     mask[_below_contact(view, table.row, heights.index, low)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
-    # On a sill the images contradict the floor, and show that it is a sill; beyond it floor goes on
-    # where above a foot there is what stands on it.
-    step_m = np.float32(settings.step_height_m)
-    sill = compared.against & (np.abs(heights.height) <= step_m)
-    mask[may_be & sill & below_floor(mask)] = FLOOR
     mask[
         (mask == FLOOR) & ~most_around(mask == FLOOR, textured & near & (off | (mask == FLOOR)))
     ] = NO_EVIDENCE
@@ -378,7 +370,7 @@ def compare(
     contradicted = (against, denied, unlike)
     masks = (*(mask & reached for mask in contradicted), ~(contrary & reached))
     costs = Costs(floor, matched, reached.astype(np.float32))
-    return Comparison(floor_px, *(_enlarged(mask, disparity.shape) for mask in masks), costs)
+    return Comparison(floor_px, *(enlarged(mask, disparity) for mask in masks), costs)
 
 
 def compare_measured(
@@ -427,11 +419,6 @@ def _local_difference(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDAr
     difference = cv2.subtract(left, right, dtype=cv2.CV_32F)
     difference -= cv2.blur(difference, (BLOCK_PX, BLOCK_PX))
     return cv2.blur(np.abs(difference), (BLOCK_PX, BLOCK_PX))
-
-
-def _enlarged(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    size = (shape[1], shape[0])
-    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
 
 
 def texture_grey(image: NDArray[np.uint8], window_px: int) -> NDArray[np.float32]:
