@@ -190,19 +190,15 @@ class FloorSegmentation:
             below_said = None if said is None else said[columns]
             if below_said is not None:
                 evidence.mask[below_said == NOT_FLOOR] = NOT_FLOOR
-        with measure('likelihood'):
-            seen = self._seen(
-                view, below, texture / enough, left_rows, heights, compared, noise, evidence.mask
-            )
-            likely = self.likelihood.of(seen)
-            evidence = dataclasses.replace(
-                evidence, mask=weighed(evidence.mask, likely, seen.floor_px)
-            )
         with measure('filling'):
             mask = self._fill(
                 view, profile, below, evidence, left_rows, textured, compared, below_said
             )
-            mask = weighed(mask, likely, seen.floor_px)
+        with measure('likelihood'):
+            seen = self._seen(
+                view, below, texture / enough, left_rows, heights, compared, noise, mask
+            )
+            mask = weighed(mask, self.likelihood.of(seen), seen.floor_px)
             if not (is_fixed or fit.is_seen):
                 mask[mask == FLOOR] = NO_EVIDENCE
             clear_hidden(mask, moving, columns)

@@ -28,20 +28,20 @@ from segfloor_ros.core.floor.disparity.profile import STEP_PX
 Picture = NDArray[np.float32]
 
 WEIGHTS = {
-    'one': 0.72,
-    'above': -0.05,
-    'below': 0.37,
-    'rises': 1.06,
-    'steep': -1.52,
-    'on': 2.37,
-    'off': -1.00,
-    'matched': -2.16,
-    'cost': -0.11,
-    'overhead': -0.32,
-    'look': 0.62,
-    'dark': -0.30,
-    'bright': -1.40,
-    'shared': -0.26,
+    'one': 0.80,
+    'above': -0.06,
+    'below': 0.35,
+    'rises': 1.02,
+    'steep': -1.50,
+    'on': 2.50,
+    'off': -0.99,
+    'matched': -2.33,
+    'cost': -0.10,
+    'overhead': -0.30,
+    'look': 0.72,
+    'dark': -0.27,
+    'bright': -1.00,
+    'shared': -0.24,
 }
 """By feature, made by `tools/fit_floor.py`.
 
@@ -55,12 +55,12 @@ often it is seen. dark, bright: by how many sigmas more than two it is darker, b
 floor. shared: whether the right camera sees it.
 """
 
-PASSED_ON = 0.44, 0.83, 1.61
+PASSED_ON = 0.42, 0.84, 1.68
 """What a pixel has of itself, and of what is passed on to it: a constant, and weights."""
 
-_SURE, _UNLIKELY = math.log(0.95 / 0.05), math.log(0.4 / 0.6)
-"""What is floor with more than the first probability is floor; by itself with less than the second
-it is none."""
+_SURE, _LIKELY, _UNLIKELY = (math.log(p / (1 - p)) for p in (0.95, 0.75, 0.4))
+"""Log odds: what is more likely floor than the first is floor, if it is by itself more likely than
+the second; what is by itself less likely than the third is none."""
 LEAST_FLOOR_PX = 2.5
 """Farther floor, of smaller disparity, is not judged."""
 
@@ -388,7 +388,7 @@ def weighed(mask: NDArray[np.uint8], likely: Likely, floor_px: Picture) -> NDArr
     nothing is known it is sure where both do.
     """
     unlikely = (likely.alone < _UNLIKELY) & (likely.together < 0)
-    sure = (likely.together > _SURE) & (likely.alone > 0) & (floor_px > LEAST_FLOOR_PX)
+    sure = (likely.together > _SURE) & (likely.alone > _LIKELY) & (floor_px > LEAST_FLOOR_PX)
     return with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))
 
 
