@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import OFFSET_SIGMA_PX, StereoCamera
 from segfloor_ros.core.contracts import Mount
-from segfloor_ros.core.floor.disparity.matching import NOISE_PX, SAME_PX
+from segfloor_ros.core.floor.disparity.matching import NOISE_PX, SAME_PX, SIGMAS
 from segfloor_ros.core.floor.disparity.profile import (
     HEIGHT_SIGMA,
     PITCH_SIGMA_RAD,
@@ -49,12 +49,9 @@ FINER_SCALES_PX = NEAR_SCALES_PX[2:]
 one that was refined by some of its samples."""
 _CLIMB, _SWAY_M = 0.03, 0.03
 """How far from parallel to the floor a camera travels: a slope, and what it sways."""
-_FAITH = 2.0
-"""So much more must speak for another expectation than for the camera as it is mounted."""
-_NOISE_SHARE = 0.01
-"""What so little of all that is seen speaks for is noise: the camera is as it is mounted."""
-_SWING_RAD = math.radians(3.0)
-"""So far robots swing on their wheels; what the map says beyond that is drift."""
+SWING = (math.radians(3.0), math.radians(3.0), 0.04)
+HAND = (math.radians(7.0), math.radians(7.0), 0.3)
+_GUESSES, _COMPARED, _REFINED = 120, 1000, 3
 _FLAT_WEIGHT = 0.1
 """Of samples whose disparity does not rise down the image as a floor's does."""
 _AT_ONCE = 200
@@ -389,7 +386,8 @@ def plane_of_frame(
     expected: Array,
     is_fixed: bool = True,
 ) -> PlaneFit:
-    """Return the plane of the floor in a frame, in its own camera's axes.
+    """Return the plane of the floor in a frame, in its own camera's axes: the likeliest by what is
+    seen and what is expected.
 
     disparity, texture: (R, W) from `first_row` on, every `column_step` columns. enough: texture
     that is no noise. expected: (P, 3), as of `expectations`. is_fixed: the camera to its base.
@@ -405,28 +403,68 @@ def plane_of_frame(
     uv_px = np.stack([columns * across, rows * step + first_row], axis=1).astype(np.float64)
     found_px = part[rows, columns].astype(np.float64)
     samples = Samples.of(camera, uv_px, found_px, weight)
-    expected = np.vstack([expected, swung(expected[0], 2 * SAME_PX / camera.fy / slope)])
-    share = scores(samples, expected) / max(samples.weight.sum(), 1e-9)
-    start = expected[likeliest(share, expected) if is_fixed else int(np.argmax(share))]
-    sigma = np.array([*2 * [PITCH_SIGMA_RAD], HEIGHT_SIGMA * start[2]])
+    prior = Prior.of(expected, is_fixed)
+    guesses = prior.means
+    if weight.sum() > 1:
+        fresh = propose(samples, _GUESSES, np.random.default_rng(0), prior)
+        few = samples.every(max(1, len(weight) // _COMPARED))
+        order = np.argsort(-log_posterior(few, fresh, prior), kind='stable')[:_REFINED]
+        guesses = np.vstack([prior.means[0], fresh[order]])
     unknown, still = np.full(3, np.nan), np.zeros((0, 3))
-    return refine(samples, start, unknown, still, start, sigma, NEAR_SCALES_PX)
+    fits = [
+        refine(samples, guess, unknown, still, *prior.nearest(guess), NEAR_SCALES_PX)
+        for guess in guesses
+    ]
+    planes = np.array([fit.angles_height for fit in fits])
+    return fits[int(np.argmax(log_posterior(samples, planes, prior)))]
 
 
-def swung(angles_height: Array, step_rad: float) -> Array:
-    """Return a camera's pitch, roll and height (N, 3) as its base swings over a bump, in steps of
-    its pitch of at most so much.
+@dataclass(frozen=True)
+class Prior:
+    """What pitch, roll and height to expect of a frame: a mixture of Gaussians with these means and
+    standard deviations, (P, 3) each, the likeliest first.
     """
-    steps = max(1, math.ceil(_SWING_RAD / step_rad))
-    angles_rad = np.delete(np.linspace(-_SWING_RAD, _SWING_RAD, 2 * steps + 1), steps)
-    return angles_height + np.outer(angles_rad, (1.0, 0.0, 0.0))
+
+    means: Array
+    sigmas: Array
+
+    @classmethod
+    def of(cls, expected: Array, is_fixed: bool) -> Prior:
+        """Return that of a camera that is expected at pitch, roll and height (P, 3)."""
+        steady = (PITCH_SIGMA_RAD, PITCH_SIGMA_RAD, HEIGHT_SIGMA)
+        means = np.vstack([expected[0], expected])
+        sigmas = np.array([steady, *len(expected) * [SWING if is_fixed else HAND]])
+        sigmas[:, 2] *= means[:, 2]
+        return cls(means, sigmas)
+
+    def log_density(self, angles_height: Array) -> Array:
+        """Return the logarithm of the density of each component (M, P) at planes (M, 3)."""
+        squares = (((angles_height[:, None] - self.means) / self.sigmas) ** 2).sum(axis=2)
+        density: Array = -0.5 * squares - np.log(self.sigmas).sum(axis=1)
+        return density
+
+    def nearest(self, angles_height: Array) -> tuple[Array, Array]:
+        """Return mean and standard deviations (3,) of the likeliest component at a plane (3,)."""
+        index = int(np.argmax(self.log_density(angles_height[None])))
+        return self.means[index], self.sigmas[index]
 
 
-def likeliest(share: Array, expected: Array) -> int:
-    """Return which expectation, of pitch, roll and height (P, 3), to start from, by the share (P,)
-    of all that is seen that speaks for each, less what speaks against it.
+def log_posterior(samples: Samples, angles_height: Array, prior: Prior) -> Array:
+    """Return the logarithm of the posterior density of planes (M, 3), up to a constant."""
+    nats = 0.5 * SIGMAS**2 / _CORRELATED_SAMPLES
+    return nats * scores(samples, angles_height) + prior.log_density(angles_height).max(axis=1)
+
+
+def propose(samples: Samples, count: int, rng: np.random.Generator, prior: Prior) -> Array:
+    """Return plausible planes (M, 3): means of the prior, and as the prior has it, half of them
+    moved up or down so that they go through a sample.
     """
-    swing = np.hypot(*(expected - expected[0])[:, :2].T)
-    likelihood = share * np.exp(-0.5 * (swing / _SWING_RAD) ** 2)
-    likelihood[0] = max(_FAITH * share[0], _NOISE_SHARE)
-    return int(np.argmax(likelihood))
+    of = rng.integers(len(prior.means), size=count)
+    drawn = prior.means[of] + rng.normal(size=(count, 3)) * prior.sigmas[of]
+    half = count // 2
+    at = rng.choice(len(samples.weight), size=half, p=samples.weight / samples.weight.sum())
+    unit = plane_of(drawn[:half] * (1, 1, 0) + (0, 0, 1))
+    below = -(unit * samples.rays[at]).sum(axis=1)
+    drawn[:half, 2] = below * samples.disparity_m / samples.disparity_px[at]
+    guesses = np.vstack([prior.means, drawn])
+    return guesses[plausible(guesses)]
