@@ -49,9 +49,8 @@ FINER_SCALES_PX = NEAR_SCALES_PX[2:]
 one that was refined by some of its samples."""
 _CLIMB, _SWAY_M = 0.03, 0.03
 """How far from parallel to the floor a camera travels: a slope, and what it sways."""
-SWING = (math.radians(3.0), math.radians(3.0), 0.04)
 HAND = (math.radians(7.0), math.radians(7.0), 0.3)
-_GUESSES, _COMPARED, _REFINED = 120, 1000, 3
+_GUESSES, _COMPARED, _REFINED = 240, 1000, 2
 _FLAT_WEIGHT = 0.1
 """Of samples whose disparity does not rise down the image as a floor's does."""
 _AT_ONCE = 200
@@ -433,7 +432,7 @@ class Prior:
         """Return that of a camera that is expected at pitch, roll and height (P, 3)."""
         steady = (PITCH_SIGMA_RAD, PITCH_SIGMA_RAD, HEIGHT_SIGMA)
         means = np.vstack([expected[0], expected])
-        sigmas = np.array([steady, *len(expected) * [SWING if is_fixed else HAND]])
+        sigmas = np.array([steady, *len(expected) * [SWAY if is_fixed else HAND]])
         sigmas[:, 2] *= means[:, 2]
         return cls(means, sigmas)
 
