@@ -158,11 +158,9 @@ class FloorSegmentation:
                 disparity[moving > 0] = 0
         below, textured = disparity[columns], texture > enough
         with measure('plane'):
-            is_fixed = self.fixture.problem is None
-            fit = plane_of_frame(
-                self._camera, first_row, below, texture, enough, expected, is_fixed
-            )
-            self.fixture.note(fit)
+            is_fixed, sway = self.fixture.problem is None, self.fixture.sway
+            fit = plane_of_frame(self._camera, first_row, below, texture, enough, expected, sway)
+            self.fixture.note(fit, expected[0])
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
         with measure('profile'):
             most = self._matcher.num_disparities
@@ -188,7 +186,7 @@ class FloorSegmentation:
             mask = self._fill(
                 view, profile, below, evidence, left_rows, textured, compared, below_said
             )
-            if not (is_fixed or fit.is_seen):
+            if not (is_fixed or fit.evidence > 0):
                 mask[mask == FLOOR] = NO_EVIDENCE
             clear_hidden(mask, moving, columns)
         with measure(DISPARITY_ABOVE):

@@ -42,6 +42,8 @@ _BEND = 0.05
 _VIOLATION_WEIGHT = 1.5
 _CORRELATED_SAMPLES = 12.0
 """Neighbouring samples err together: so many count as one."""
+_NATS = 0.5 * SIGMAS**2 / _CORRELATED_SAMPLES
+"""Logarithm of a likelihood, of one in `scores`."""
 _SCALES_PX = (3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5)
 NEAR_SCALES_PX = (2.0, 1.5, 1.0, 0.7, 0.5, 0.5)
 FINER_SCALES_PX = NEAR_SCALES_PX[2:]
@@ -49,8 +51,8 @@ FINER_SCALES_PX = NEAR_SCALES_PX[2:]
 one that was refined by some of its samples."""
 _CLIMB, _SWAY_M = 0.03, 0.03
 """How far from parallel to the floor a camera travels: a slope, and what it sways."""
-HAND = (math.radians(7.0), math.radians(7.0), 0.3)
 _GUESSES, _COMPARED, _REFINED = 240, 1000, 2
+"""So many planes are guessed for a frame, compared by about so many samples, and refined."""
 _FLAT_WEIGHT = 0.1
 """Of samples whose disparity does not rise down the image as a floor's does."""
 _AT_ONCE = 200
@@ -135,7 +137,7 @@ SWAY = (math.radians(2.0), math.radians(2.5), 0.04)
 """How much pitch, roll and height, as a share of it, of the camera above the floor vary on the way,
 as standard deviations: robots sway, and where they are is known so well.
 """
-_INTERVAL_PERCENT = (2.5, 16, 50, 84, 97.5)
+_INTERVAL_PERCENT, _SIGMA_PERCENT = (2.5, 16, 50, 84, 97.5), 68
 """One and two sigmas to either side of the median: a few wrong planes do not count."""
 _LEAST_SUPPORT, _MOST_BELOW = 0.08, 0.15
 """A floor is so much of what is seen where it is visible. What is seen below it, of mirrors and
@@ -147,13 +149,15 @@ wrong matches, is so small a share of that: of true floors 0.11 at most, of boar
 class PlaneFit:
     """A refined plane: angles_height (3,) = pitch_rad, roll_rad, height_m of the camera;
     sigma (3,) of them; support: share of the weight of the samples below the plane's horizon
-    that lies on it; violations: share that lies below it.
+    that lies on it; violations: share that lies below it. evidence: of the plane of a frame, the
+    logarithm of how much likelier all that is seen is with it than without.
     """
 
     angles_height: Array
     sigma: Array
     support: float
     violations: float
+    evidence: float = math.nan
 
     @property
     def is_seen(self) -> bool:
@@ -162,21 +166,29 @@ class PlaneFit:
 
 
 class Fixture:
-    """Whether the camera is fixed to its base: then the planes of all frames lie equally far below
-    it. problem: in words, once they do not. A hand does not hold a camera like that.
+    """How firmly the camera is fixed to its base, by the planes of its frames. sway: (3,) of pitch
+    and roll in radians, and of the height as a share of it, by how much the planes of frames differ
+    from the mount, as standard deviations. problem: in words, once the height of the camera varies
+    by more than robots sway. A hand does not hold a camera like that.
     """
 
     def __init__(self) -> None:
         self.problem: str | None = None
-        self._heights_m: list[float] = []
+        self.sway = np.array(SWAY)
+        self._planes: list[Array] = []
 
-    def note(self, fit: PlaneFit) -> None:
-        """Take in the plane of a frame."""
-        if not fit.is_seen:
+    def note(self, fit: PlaneFit, mounted: Array) -> None:
+        """Take in the plane of a frame of a camera on a mount of pitch, roll and height (3,)."""
+        if not fit.evidence > 0:
             return
-        self._heights_m.append(float(fit.angles_height[2]))
-        low, minus, middle, plus, high = np.percentile(self._heights_m, _INTERVAL_PERCENT)
-        if len(self._heights_m) >= LOOKS and plus - minus > 2 * SWAY[2] * middle:
+        self._planes.append(fit.angles_height)
+        if len(self._planes) < LOOKS:
+            return
+        off = np.abs(self._planes - mounted) / (1.0, 1.0, mounted[2])
+        self.sway = np.maximum(SWAY, np.percentile(off, _SIGMA_PERCENT, axis=0))
+        heights_m = np.array(self._planes)[:, 2]
+        low, minus, middle, plus, high = np.percentile(heights_m, _INTERVAL_PERCENT)
+        if plus - minus > 2 * SWAY[2] * middle:
             self.problem = (
                 'the camera is not fixed to its base: its height above the floor varies by '
                 f'{high - low:.2f} m; fix it. There is floor only where an image shows its plane'
@@ -383,13 +395,13 @@ def plane_of_frame(
     texture: NDArray[np.float32],
     enough: float,
     expected: Array,
-    is_fixed: bool = True,
+    sway: Sequence[float] | Array = SWAY,
 ) -> PlaneFit:
     """Return the plane of the floor in a frame, in its own camera's axes: the likeliest by what is
     seen and what is expected.
 
     disparity, texture: (R, W) from `first_row` on, every `column_step` columns. enough: texture
-    that is no noise. expected: (P, 3), as of `expectations`. is_fixed: the camera to its base.
+    that is no noise. expected: (P, 3), as of `expectations`. sway: (3,), as of `Fixture`.
     """
     step = max(2, round(math.sqrt(disparity.size / SAMPLES)))
     part = disparity[::step, ::step]
@@ -402,68 +414,75 @@ def plane_of_frame(
     uv_px = np.stack([columns * across, rows * step + first_row], axis=1).astype(np.float64)
     found_px = part[rows, columns].astype(np.float64)
     samples = Samples.of(camera, uv_px, found_px, weight)
-    prior = Prior.of(expected, is_fixed)
-    guesses = prior.means
-    if weight.sum() > 1:
-        fresh = propose(samples, _GUESSES, np.random.default_rng(0), prior)
-        few = samples.every(max(1, len(weight) // _COMPARED))
-        order = np.argsort(-log_posterior(few, fresh, prior), kind='stable')[:_REFINED]
-        guesses = np.vstack([prior.means[0], fresh[order]])
-    unknown, still = np.full(3, np.nan), np.zeros((0, 3))
-    fits = [
-        refine(samples, guess, unknown, still, *prior.nearest(guess), NEAR_SCALES_PX)
-        for guess in guesses
-    ]
-    planes = np.array([fit.angles_height for fit in fits])
-    return fits[int(np.argmax(log_posterior(samples, planes, prior)))]
+    prior = FramePrior.of(expected, np.asarray(sway))
+    guesses = _guess(samples, prior)
+    fits = [_refined(samples, guess, prior) for guess in guesses]
+    return max(fits, key=lambda fit: fit.evidence)
 
 
 @dataclass(frozen=True)
-class Prior:
+class FramePrior:
     """What pitch, roll and height to expect of a frame: a mixture of Gaussians with these means and
-    standard deviations, (P, 3) each, the likeliest first.
+    standard deviations, (P, 3) each. The first one is the camera as it is mounted.
     """
 
     means: Array
     sigmas: Array
 
     @classmethod
-    def of(cls, expected: Array, is_fixed: bool) -> Prior:
-        """Return that of a camera that is expected at pitch, roll and height (P, 3)."""
-        steady = (PITCH_SIGMA_RAD, PITCH_SIGMA_RAD, HEIGHT_SIGMA)
+    def of(cls, expected: Array, sway: Array) -> FramePrior:
+        """Return that of a camera whose base stands still, or sways about what is expected (P, 3)
+        with standard deviations (3,).
+        """
+        still = (PITCH_SIGMA_RAD, PITCH_SIGMA_RAD, HEIGHT_SIGMA)
         means = np.vstack([expected[0], expected])
-        sigmas = np.array([steady, *len(expected) * [SWAY if is_fixed else HAND]])
+        sigmas = np.vstack([still, np.tile(sway, (len(expected), 1))])
         sigmas[:, 2] *= means[:, 2]
         return cls(means, sigmas)
 
     def log_density(self, angles_height: Array) -> Array:
-        """Return the logarithm of the density of each component (M, P) at planes (M, 3)."""
+        """Return the logarithms of the density of each component (M, P) at planes (M, 3)."""
         squares = (((angles_height[:, None] - self.means) / self.sigmas) ** 2).sum(axis=2)
         density: Array = -0.5 * squares - np.log(self.sigmas).sum(axis=1)
-        return density
+        return density - 1.5 * math.log(2 * math.pi)
 
-    def nearest(self, angles_height: Array) -> tuple[Array, Array]:
-        """Return mean and standard deviations (3,) of the likeliest component at a plane (3,)."""
-        index = int(np.argmax(self.log_density(angles_height[None])))
-        return self.means[index], self.sigmas[index]
-
-
-def log_posterior(samples: Samples, angles_height: Array, prior: Prior) -> Array:
-    """Return the logarithm of the posterior density of planes (M, 3), up to a constant."""
-    nats = 0.5 * SIGMAS**2 / _CORRELATED_SAMPLES
-    return nats * scores(samples, angles_height) + prior.log_density(angles_height).max(axis=1)
+    def draw(self, count: int, rng: np.random.Generator) -> Array:
+        """Return planes (N, 3) that it expects."""
+        of = rng.integers(len(self.means), size=count)
+        drawn: Array = rng.normal(self.means[of], self.sigmas[of])
+        return drawn
 
 
-def propose(samples: Samples, count: int, rng: np.random.Generator, prior: Prior) -> Array:
-    """Return plausible planes (M, 3): means of the prior, and as the prior has it, half of them
-    moved up or down so that they go through a sample.
+def _guess(samples: Samples, prior: FramePrior) -> Array:
+    """Return the planes (M, 3) to refine: as the camera is mounted, and the likeliest of those that
+    are drawn from the prior, half of them raised or lowered such that a sample lies on them.
     """
-    of = rng.integers(len(prior.means), size=count)
-    drawn = prior.means[of] + rng.normal(size=(count, 3)) * prior.sigmas[of]
-    half = count // 2
-    at = rng.choice(len(samples.weight), size=half, p=samples.weight / samples.weight.sum())
-    unit = plane_of(drawn[:half] * (1, 1, 0) + (0, 0, 1))
-    below = -(unit * samples.rays[at]).sum(axis=1)
-    drawn[:half, 2] = below * samples.disparity_m / samples.disparity_px[at]
+    mounted, total = prior.means[:1], samples.weight.sum()
+    if total == 0:
+        return mounted
+    rng = np.random.default_rng(0)
+    drawn = prior.draw(_GUESSES, rng)
+    on = rng.choice(len(samples.weight), size=_GUESSES // 2, p=samples.weight / total)
+    depth_m = samples.disparity_m / samples.disparity_px[on]
+    unit = plane_of(np.column_stack([drawn[: len(on), :2], np.ones(len(on))]))
+    drawn[: len(on), 2] = -depth_m * (unit * samples.rays[on]).sum(axis=1)
     guesses = np.vstack([prior.means, drawn])
-    return guesses[plausible(guesses)]
+    guesses = guesses[plausible(guesses)]
+    some = samples.every(max(1, len(samples.weight) // _COMPARED))
+    likelihood = _NATS * scores(some, guesses) + prior.log_density(guesses).max(axis=1)
+    likeliest = np.argsort(-likelihood, kind='stable')[:_REFINED]
+    return np.vstack([mounted, guesses[likeliest]])
+
+
+def _refined(samples: Samples, guess: Array, prior: FramePrior) -> PlaneFit:
+    """Return a plane (3,) refined, with its evidence by Laplace's approximation: Bishop, Pattern
+    Recognition and Machine Learning, 2006, section 4.4.1.
+    """
+    nearest = int(np.argmax(prior.log_density(guess[None])))
+    mean, sigma = prior.means[nearest], prior.sigmas[nearest]
+    unknown, still = np.full(3, np.nan), np.zeros((0, 3))
+    fit = refine(samples, guess, unknown, still, mean, sigma, NEAR_SCALES_PX)
+    plane = fit.angles_height[None]
+    volume = np.log(fit.sigma).sum() + 1.5 * math.log(2 * math.pi)
+    likelihood = _NATS * scores(samples, plane)[0]
+    return replace(fit, evidence=float(likelihood + prior.log_density(plane).max() + volume))
