@@ -158,9 +158,9 @@ class FloorSegmentation:
                 disparity[moving > 0] = 0
         below, textured = disparity[columns], texture > enough
         with measure('plane'):
-            is_fixed, sway = self.fixture.problem is None, self.fixture.sway
-            fit = plane_of_frame(self._camera, first_row, below, texture, enough, expected, sway)
-            self.fixture.note(fit, expected[0])
+            is_fixed = self.fixture.problem is None
+            fit = plane_of_frame(self._camera, first_row, below, texture, enough, expected)
+            self.fixture.note(fit)
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
         with measure('profile'):
             most = self._matcher.num_disparities
@@ -186,7 +186,7 @@ class FloorSegmentation:
             mask = self._fill(
                 view, profile, below, evidence, left_rows, textured, compared, below_said
             )
-            if not (is_fixed or fit.evidence > 0):
+            if not (is_fixed or fit.is_proved):
                 mask[mask == FLOOR] = NO_EVIDENCE
             clear_hidden(mask, moving, columns)
         with measure(DISPARITY_ABOVE):

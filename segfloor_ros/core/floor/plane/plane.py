@@ -137,12 +137,16 @@ SWAY = (math.radians(2.0), math.radians(2.5), 0.04)
 """How much pitch, roll and height, as a share of it, of the camera above the floor vary on the way,
 as standard deviations: robots sway, and where they are is known so well.
 """
-_INTERVAL_PERCENT, _SIGMA_PERCENT = (2.5, 16, 50, 84, 97.5), 68
+_INTERVAL_PERCENT = (2.5, 16, 50, 84, 97.5)
 """One and two sigmas to either side of the median: a few wrong planes do not count."""
 _LEAST_SUPPORT, _MOST_BELOW = 0.08, 0.15
 """A floor is so much of what is seen where it is visible. What is seen below it, of mirrors and
 wrong matches, is so small a share of that: of true floors 0.11 at most, of boards 0.2 to 0.4.
 """
+
+
+_PROVED = math.log(20)
+"""Of planes with this evidence one in twenty is there by chance."""
 
 
 @dataclass(frozen=True)
@@ -160,35 +164,32 @@ class PlaneFit:
     evidence: float = math.nan
 
     @property
+    def is_proved(self) -> bool:
+        """Whether what is seen proves that the plane of a frame is there."""
+        return self.evidence > _PROVED
+
+    @property
     def is_seen(self) -> bool:
         """Whether enough is seen on it, and little enough below it, for a floor."""
         return self.support > _LEAST_SUPPORT and self.violations < _MOST_BELOW * self.support
 
 
 class Fixture:
-    """How firmly the camera is fixed to its base, by the planes of its frames. sway: (3,) of pitch
-    and roll in radians, and of the height as a share of it, by how much the planes of frames differ
-    from the mount, as standard deviations. problem: in words, once the height of the camera varies
-    by more than robots sway. A hand does not hold a camera like that.
+    """What the planes of frames say of how the camera is fixed to its base. problem: in words, once
+    their heights vary by more than robots sway: a hand does not hold a camera like that.
     """
 
     def __init__(self) -> None:
         self.problem: str | None = None
-        self.sway = np.array(SWAY)
-        self._planes: list[Array] = []
+        self._heights_m: list[float] = []
 
-    def note(self, fit: PlaneFit, mounted: Array) -> None:
-        """Take in the plane of a frame of a camera on a mount of pitch, roll and height (3,)."""
-        if not fit.evidence > 0:
+    def note(self, fit: PlaneFit) -> None:
+        """Take in the plane of a frame."""
+        if not fit.is_proved:
             return
-        self._planes.append(fit.angles_height)
-        if len(self._planes) < LOOKS:
-            return
-        off = np.abs(self._planes - mounted) / (1.0, 1.0, mounted[2])
-        self.sway = np.maximum(SWAY, np.percentile(off, _SIGMA_PERCENT, axis=0))
-        heights_m = np.array(self._planes)[:, 2]
-        low, minus, middle, plus, high = np.percentile(heights_m, _INTERVAL_PERCENT)
-        if plus - minus > 2 * SWAY[2] * middle:
+        self._heights_m.append(float(fit.angles_height[2]))
+        low, minus, middle, plus, high = np.percentile(self._heights_m, _INTERVAL_PERCENT)
+        if len(self._heights_m) >= LOOKS and plus - minus > 2 * SWAY[2] * middle:
             self.problem = (
                 'the camera is not fixed to its base: its height above the floor varies by '
                 f'{high - low:.2f} m; fix it. There is floor only where an image shows its plane'
@@ -374,7 +375,7 @@ def texture_weight(texture: NDArray[np.floating], enough: float) -> Array:
 
 
 def expectations(mount: Mount, T_map_base: Array | None) -> Array:
-    """Return what pitch, roll and height to expect of a frame, (P, 3), the likeliest first.
+    """Return what pitch, roll and height to expect of a frame, (P, 3).
 
     As the camera is mounted; or, should the robot pitch or roll on its wheels, level in the map;
     or, of a camera in a hand, as high as it is in the map.
@@ -395,13 +396,12 @@ def plane_of_frame(
     texture: NDArray[np.float32],
     enough: float,
     expected: Array,
-    sway: Sequence[float] | Array = SWAY,
 ) -> PlaneFit:
     """Return the plane of the floor in a frame, in its own camera's axes: the likeliest by what is
     seen and what is expected.
 
     disparity, texture: (R, W) from `first_row` on, every `column_step` columns. enough: texture
-    that is no noise. expected: (P, 3), as of `expectations`. sway: (3,), as of `Fixture`.
+    that is no noise. expected: (P, 3), as of `expectations`.
     """
     step = max(2, round(math.sqrt(disparity.size / SAMPLES)))
     part = disparity[::step, ::step]
@@ -414,7 +414,7 @@ def plane_of_frame(
     uv_px = np.stack([columns * across, rows * step + first_row], axis=1).astype(np.float64)
     found_px = part[rows, columns].astype(np.float64)
     samples = Samples.of(camera, uv_px, found_px, weight)
-    prior = FramePrior.of(expected, np.asarray(sway))
+    prior = FramePrior.of(expected)
     guesses = _guess(samples, prior)
     fits = [_refined(samples, guess, prior) for guess in guesses]
     return max(fits, key=lambda fit: fit.evidence)
@@ -430,13 +430,12 @@ class FramePrior:
     sigmas: Array
 
     @classmethod
-    def of(cls, expected: Array, sway: Array) -> FramePrior:
-        """Return that of a camera whose base stands still, or sways about what is expected (P, 3)
-        with standard deviations (3,).
+    def of(cls, expected: Array) -> FramePrior:
+        """Return that of a camera whose base stands still, or sways about what is expected (P, 3).
         """
         still = (PITCH_SIGMA_RAD, PITCH_SIGMA_RAD, HEIGHT_SIGMA)
         means = np.vstack([expected[0], expected])
-        sigmas = np.vstack([still, np.tile(sway, (len(expected), 1))])
+        sigmas = np.vstack([still, np.tile(SWAY, (len(expected), 1))])
         sigmas[:, 2] *= means[:, 2]
         return cls(means, sigmas)
 
