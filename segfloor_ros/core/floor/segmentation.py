@@ -159,8 +159,9 @@ class FloorSegmentation:
         below, textured = disparity[columns], texture > enough
         with measure('plane'):
             is_fixed = self.fixture.problem is None
-            fit = plane_of_frame(self._camera, first_row, below, texture, enough, expected)
-            self.fixture.note(fit)
+            seen = self._camera, first_row, below, texture, enough, expected
+            fit = plane_of_frame(*seen, is_fixed)
+            self.fixture.note(fit if fit.is_proved else plane_of_frame(*seen, False))
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
         with measure('profile'):
             most = self._matcher.num_disparities

@@ -51,6 +51,8 @@ FINER_SCALES_PX = NEAR_SCALES_PX[2:]
 one that was refined by some of its samples."""
 _CLIMB, _SWAY_M = 0.03, 0.03
 """How far from parallel to the floor a camera travels: a slope, and what it sways."""
+SURE = 3.0
+"""Sigmas within which nearly all lies."""
 _GUESSES, _COMPARED, _REFINED = 240, 1000, 2
 """So many planes are guessed for a frame, compared by about so many samples, and refined."""
 _FLAT_WEIGHT = 0.1
@@ -185,7 +187,7 @@ class Fixture:
 
     def note(self, fit: PlaneFit) -> None:
         """Take in the plane of a frame."""
-        if not fit.is_proved:
+        if not (fit.is_proved and fit.is_seen):
             return
         self._heights_m.append(float(fit.angles_height[2]))
         low, minus, middle, plus, high = np.percentile(self._heights_m, _INTERVAL_PERCENT)
@@ -396,12 +398,13 @@ def plane_of_frame(
     texture: NDArray[np.float32],
     enough: float,
     expected: Array,
+    is_fixed: bool = True,
 ) -> PlaneFit:
     """Return the plane of the floor in a frame, in its own camera's axes: the likeliest by what is
     seen and what is expected.
 
     disparity, texture: (R, W) from `first_row` on, every `column_step` columns. enough: texture
-    that is no noise. expected: (P, 3), as of `expectations`.
+    that is no noise. expected: (P, 3), as of `expectations`. is_fixed: the camera to its base.
     """
     step = max(2, round(math.sqrt(disparity.size / SAMPLES)))
     part = disparity[::step, ::step]
@@ -414,7 +417,7 @@ def plane_of_frame(
     uv_px = np.stack([columns * across, rows * step + first_row], axis=1).astype(np.float64)
     found_px = part[rows, columns].astype(np.float64)
     samples = Samples.of(camera, uv_px, found_px, weight)
-    prior = FramePrior.of(expected)
+    prior = FramePrior.of(expected, is_fixed)
     guesses = _guess(samples, prior)
     fits = [_refined(samples, guess, prior) for guess in guesses]
     return max(fits, key=lambda fit: fit.evidence)
@@ -428,21 +431,23 @@ class FramePrior:
 
     means: Array
     sigmas: Array
+    most: float
 
     @classmethod
-    def of(cls, expected: Array) -> FramePrior:
+    def of(cls, expected: Array, is_fixed: bool) -> FramePrior:
         """Return that of a camera whose base stands still, or sways about what is expected (P, 3).
         """
         still = (PITCH_SIGMA_RAD, PITCH_SIGMA_RAD, HEIGHT_SIGMA)
         means = np.vstack([expected[0], expected])
         sigmas = np.vstack([still, np.tile(SWAY, (len(expected), 1))])
         sigmas[:, 2] *= means[:, 2]
-        return cls(means, sigmas)
+        return cls(means, sigmas, SURE if is_fixed else math.inf)
 
     def log_density(self, angles_height: Array) -> Array:
         """Return the logarithms of the density of each component (M, P) at planes (M, 3)."""
-        squares = (((angles_height[:, None] - self.means) / self.sigmas) ** 2).sum(axis=2)
-        density: Array = -0.5 * squares - np.log(self.sigmas).sum(axis=1)
+        off = (angles_height[:, None] - self.means) / self.sigmas
+        density = -0.5 * (off**2).sum(axis=2) - np.log(self.sigmas).sum(axis=1)
+        density[(np.abs(off) > self.most).any(axis=2)] = -math.inf
         return density - 1.5 * math.log(2 * math.pi)
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
