@@ -183,15 +183,24 @@ class Fixture:
 
     def __init__(self) -> None:
         self.problem: str | None = None
-        self._heights_m: list[float] = []
+        self._planes: list[Array] = []
+
+    @property
+    def usual(self) -> Array:
+        """Pitch, roll and height (1, 3) of the camera in most frames; (0, 3) while few were seen.
+        """
+        if len(self._planes) < LOOKS:
+            return np.zeros((0, 3))
+        return np.median(self._planes, axis=0)[None]
 
     def note(self, fit: PlaneFit) -> None:
         """Take in the plane of a frame."""
         if not (fit.is_proved and fit.is_seen):
             return
-        self._heights_m.append(float(fit.angles_height[2]))
-        low, minus, middle, plus, high = np.percentile(self._heights_m, _INTERVAL_PERCENT)
-        if len(self._heights_m) >= LOOKS and plus - minus > 2 * SWAY[2] * middle:
+        self._planes.append(fit.angles_height)
+        heights_m = np.array(self._planes)[:, 2]
+        low, minus, middle, plus, high = np.percentile(heights_m, _INTERVAL_PERCENT)
+        if len(heights_m) >= LOOKS and plus - minus > 2 * SWAY[2] * middle:
             self.problem = (
                 'the camera is not fixed to its base: its height above the floor varies by '
                 f'{high - low:.2f} m; fix it. There is floor only where an image shows its plane'
