@@ -132,7 +132,8 @@ class FloorSegmentation:
         """
         measure = self._times.measure
         self._prepare(mount)
-        expected = np.vstack([expectations(mount, T_map_base), self.fixture.usual])
+        expected = expectations(mount, T_map_base)
+        expected = np.vstack([expected, self.fixture.usual(expected[0])])
         first_row = min(first_floor_row(self._camera, _with_angles(mount, one)) for one in expected)
         columns = np.s_[first_row:, :: column_step(self._camera)]
         with measure('texture'):

@@ -51,7 +51,7 @@ FINER_SCALES_PX = NEAR_SCALES_PX[2:]
 one that was refined by some of its samples."""
 _CLIMB, _SWAY_M = 0.03, 0.03
 """How far from parallel to the floor a camera travels: a slope, and what it sways."""
-SURE = 3.0
+_SURE = 3.0
 """Sigmas within which nearly all lies."""
 _GUESSES, _COMPARED, _REFINED = 240, 1000, 2
 """So many planes are guessed for a frame, compared by about so many samples, and refined."""
@@ -185,13 +185,14 @@ class Fixture:
         self.problem: str | None = None
         self._planes: list[Array] = []
 
-    @property
-    def usual(self) -> Array:
-        """Pitch, roll and height (1, 3) of the camera in most frames; (0, 3) while few were seen.
+    def usual(self, mounted: Array) -> Array:
+        """Return pitch, roll and height (1, 3) of the camera in most frames, where that is not how
+        it is mounted (3,); (0, 3) where it is, and while few frames were seen.
         """
-        if len(self._planes) < LOOKS:
-            return np.zeros((0, 3))
-        return np.median(self._planes, axis=0)[None]
+        usual = np.median(self._planes or [mounted], axis=0)
+        off = np.abs(usual - mounted) / (1.0, 1.0, mounted[2])
+        is_other = len(self._planes) >= LOOKS and (off > _SURE * np.array(SWAY)).any()
+        return usual[None] if is_other else np.zeros((0, 3))
 
     def note(self, fit: PlaneFit) -> None:
         """Take in the plane of a frame."""
@@ -450,7 +451,7 @@ class FramePrior:
         means = np.vstack([expected[0], expected])
         sigmas = np.vstack([still, np.tile(SWAY, (len(expected), 1))])
         sigmas[:, 2] *= means[:, 2]
-        return cls(means, sigmas, SURE if is_fixed else math.inf)
+        return cls(means, sigmas, _SURE if is_fixed else math.inf)
 
     def log_density(self, angles_height: Array) -> Array:
         """Return the logarithms of the density of each component (M, P) at planes (M, 3)."""
