@@ -376,13 +376,11 @@ def _add_travel(information: Array, gradient: Array, state: Array, travel: Array
 
 
 def texture_weight(texture: NDArray[np.floating], enough: float) -> Array:
-    """Return how much disparities count where the image has some texture, in [0, 1]. enough: what
-    is no noise; clearly more is needed for a plane.
+    """Return how much disparities count, in [0, 1]: their variance falls with the square of the
+    texture. enough: texture that is no noise; clearly more is needed for a plane.
     """
-    grey = texture.astype(np.float64) / (4 * enough)
-    grey *= grey
-    grey *= grey
-    weight: Array = grey / (grey + 1)
+    square = (texture / (2.0 * enough)) ** 2
+    weight: Array = square / (square + 1.0)
     return weight
 
 
