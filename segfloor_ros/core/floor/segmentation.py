@@ -162,7 +162,8 @@ class FloorSegmentation:
             is_fixed = self.fixture.problem is None
             seen = self._camera, first_row, below, texture, enough, expected
             fit = plane_of_frame(*seen, is_fixed)
-            self.fixture.note(fit if fit.is_proved else plane_of_frame(*seen, False))
+            is_lost = is_fixed and not fit.is_proved
+            self.fixture.note(plane_of_frame(*seen, is_fixed=False) if is_lost else fit)
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
         with measure('profile'):
             most = self._matcher.num_disparities

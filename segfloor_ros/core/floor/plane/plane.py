@@ -443,8 +443,7 @@ class FramePrior:
 
     @classmethod
     def of(cls, expected: Array, is_fixed: bool) -> FramePrior:
-        """Return that of a camera whose base stands still, or sways about what is expected (P, 3).
-        """
+        """Return that of a camera whose base stands still, or sways about what is expected (P, 3)."""
         still = (PITCH_SIGMA_RAD, PITCH_SIGMA_RAD, HEIGHT_SIGMA)
         means = np.vstack([expected[0], expected])
         sigmas = np.vstack([still, np.tile(SWAY, (len(expected), 1))])
