@@ -51,10 +51,10 @@ FINER_SCALES_PX = NEAR_SCALES_PX[2:]
 one that was refined by some of its samples."""
 _CLIMB, _SWAY_M = 0.03, 0.03
 """How far from parallel to the floor a camera travels: a slope, and what it sways."""
-_SURE = 3.0
+SURE = 3.0
 """Sigmas within which nearly all lies."""
-_GUESSES, _COMPARED, _REFINED = 240, 1000, 2
-"""So many planes are guessed for a frame, compared by about so many samples, and refined."""
+PROPOSALS = 120
+"""So many planes are proposed at once."""
 _FLAT_WEIGHT = 0.1
 """Of samples whose disparity does not rise down the image as a floor's does."""
 _AT_ONCE = 200
@@ -191,7 +191,7 @@ class Fixture:
         """
         usual = np.median(self._planes or [mounted], axis=0)
         off = np.abs(usual - mounted) / (1.0, 1.0, mounted[2])
-        is_other = len(self._planes) >= LOOKS and (off > _SURE * np.array(SWAY)).any()
+        is_other = len(self._planes) >= LOOKS and (off > SURE * np.array(SWAY)).any()
         return usual[None] if is_other else np.zeros((0, 3))
 
     def note(self, fit: PlaneFit) -> None:
@@ -426,7 +426,9 @@ def plane_of_frame(
     found_px = part[rows, columns].astype(np.float64)
     samples = Samples.of(camera, uv_px, found_px, weight)
     prior = FramePrior.of(expected, is_fixed)
-    guesses = _guess(samples, prior)
+    guesses = [prior.means[0]]
+    if weight.sum() > 0:
+        guesses.append(_likeliest(samples, prior))
     fits = [_refined(samples, guess, prior) for guess in guesses]
     return max(fits, key=lambda fit: fit.evidence)
 
@@ -443,12 +445,12 @@ class FramePrior:
 
     @classmethod
     def of(cls, expected: Array, is_fixed: bool) -> FramePrior:
-        """Return that of a camera whose base stands still, or sways about what is expected (P, 3)."""
+        """Return that of a base that stands still, or sways about what is expected (P, 3)."""
         still = (PITCH_SIGMA_RAD, PITCH_SIGMA_RAD, HEIGHT_SIGMA)
         means = np.vstack([expected[0], expected])
         sigmas = np.vstack([still, np.tile(SWAY, (len(expected), 1))])
         sigmas[:, 2] *= means[:, 2]
-        return cls(means, sigmas, _SURE if is_fixed else math.inf)
+        return cls(means, sigmas, SURE if is_fixed else math.inf)
 
     def log_density(self, angles_height: Array) -> Array:
         """Return the logarithms of the density of each component (M, P) at planes (M, 3)."""
@@ -464,25 +466,22 @@ class FramePrior:
         return drawn
 
 
-def _guess(samples: Samples, prior: FramePrior) -> Array:
-    """Return the planes (M, 3) to refine: as the camera is mounted, and the likeliest of those that
-    are drawn from the prior, half of them raised or lowered such that a sample lies on them.
+def _likeliest(samples: Samples, prior: FramePrior) -> Array:
+    """Return the likeliest plane (3,) of those that are drawn from the prior, half of them raised
+    or lowered such that a sample lies on them. samples: at least one.
     """
-    mounted, total = prior.means[:1], samples.weight.sum()
-    if total == 0:
-        return mounted
     rng = np.random.default_rng(0)
-    drawn = prior.draw(_GUESSES, rng)
-    on = rng.choice(len(samples.weight), size=_GUESSES // 2, p=samples.weight / total)
-    depth_m = samples.disparity_m / samples.disparity_px[on]
+    drawn = prior.draw(2 * PROPOSALS, rng)
+    weight = samples.weight / samples.weight.sum()
+    on = rng.choice(len(weight), size=PROPOSALS, p=weight)
     unit = plane_of(np.column_stack([drawn[: len(on), :2], np.ones(len(on))]))
+    depth_m = samples.disparity_m / samples.disparity_px[on]
     drawn[: len(on), 2] = -depth_m * (unit * samples.rays[on]).sum(axis=1)
     guesses = np.vstack([prior.means, drawn])
     guesses = guesses[plausible(guesses)]
-    some = samples.every(max(1, len(samples.weight) // _COMPARED))
-    likelihood = _NATS * scores(some, guesses) + prior.log_density(guesses).max(axis=1)
-    likeliest = np.argsort(-likelihood, kind='stable')[:_REFINED]
-    return np.vstack([mounted, guesses[likeliest]])
+    likelihood = _NATS * scores(samples.every(int(_CORRELATED_SAMPLES)), guesses)
+    best: Array = guesses[np.argmax(likelihood + prior.log_density(guesses).max(axis=1))]
+    return best
 
 
 def _refined(samples: Samples, guess: Array, prior: FramePrior) -> PlaneFit:
