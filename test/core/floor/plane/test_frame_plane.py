@@ -173,6 +173,20 @@ def carried(heights_m: list[float], *patches: Patch) -> FloorSegmentation:
     return stage
 
 
+def test_the_floor_is_found_once_frames_show_that_the_mount_is_another():
+    """A wrong mount was given: a quarter too low, and pitched by 10 degrees too little. One frame
+    alone may look down from the edge of a stage.
+    """
+    true = Mount(1.25 * MOUNT.height_m, MOUNT.pitch_rad + np.radians(10.0))
+    left, right, floor, _ = Scene([floor_patch(), wall()], SMALL_CAMERA, true).render()
+    stage = FloorSegmentation(SMALL_CAMERA, FloorSegmentationSettings())
+    masks = [stage.process(left, right, MOUNT, np.eye(4)).mask for _ in range(6)]
+    found = [(mask[floor] == FLOOR).mean() for mask in masks]
+    assert max(found[:4]) < 0.6
+    assert min(found[4:]) > 0.9
+    assert stage.fixture.problem is None
+
+
 def test_a_camera_in_a_hand_is_said_to_be_in_one():
     scene = floor_patch(), wall(), *box(1.6, 0.5, 0.4, 0.3)
     assert carried([0.30, 0.303, 0.30, 0.297, 0.30], *scene).fixture.problem is None
