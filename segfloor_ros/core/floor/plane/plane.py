@@ -459,19 +459,14 @@ class FramePrior:
         density[(np.abs(off) > self.most).any(axis=2)] = -math.inf
         return density - 1.5 * math.log(2 * math.pi)
 
-    def draw(self, count: int, rng: np.random.Generator) -> Array:
-        """Return planes (N, 3) that it expects."""
-        of = rng.integers(len(self.means), size=count)
-        drawn: Array = rng.normal(self.means[of], self.sigmas[of])
-        return drawn
-
 
 def _likeliest(samples: Samples, prior: FramePrior) -> Array:
     """Return the likeliest plane (3,) of those that are drawn from the prior, half of them raised
     or lowered such that a sample lies on them. samples: at least one.
     """
     rng = np.random.default_rng(0)
-    drawn = prior.draw(2 * PROPOSALS, rng)
+    of = rng.integers(len(prior.means), size=2 * PROPOSALS)
+    drawn = rng.normal(prior.means[of], prior.sigmas[of])
     weight = samples.weight / samples.weight.sum()
     on = rng.choice(len(weight), size=PROPOSALS, p=weight)
     unit = plane_of(np.column_stack([drawn[: len(on), :2], np.ones(len(on))]))
