@@ -159,9 +159,7 @@ FLOOR: dict[str, Mechanism] = {
             )
         }
     ),
-    'swings over bumps': Mechanism(
-        {'core.floor.plane.plane.swung': lambda angles_height, _: np.zeros((0, len(angles_height)))}
-    ),
+    'swings over bumps': Mechanism({'core.floor.plane.plane.PROPOSALS': 0}),
     'guard at the right border': Mechanism({'core.floor.segmentation._BORDER_BLOCKS': 0}),
     'floor up to contacts': Mechanism(
         {'core.floor.mask.filling.fill_to_contact': lambda view, mask, alike, *_: _nowhere(alike)}

@@ -141,6 +141,7 @@ class FloorSegmentation:
         measure = self._times.measure
         self._prepare(mount)
         expected = expectations(mount, T_map_base)
+        expected = np.vstack([expected, self.fixture.usual(expected[0])])
         first_row = min(first_floor_row(self._camera, _with_angles(mount, one)) for one in expected)
         columns = np.s_[first_row:, :: column_step(self._camera)]
         with measure('texture'):
@@ -167,10 +168,10 @@ class FloorSegmentation:
         below, textured = disparity[columns], texture > enough
         with measure('plane'):
             is_fixed = self.fixture.problem is None
-            fit = plane_of_frame(
-                self._camera, first_row, below, texture, enough, expected, is_fixed
-            )
-            self.fixture.note(fit)
+            seen = self._camera, first_row, below, texture, enough, expected
+            fit = plane_of_frame(*seen, is_fixed)
+            is_lost = is_fixed and not fit.is_proved
+            self.fixture.note(plane_of_frame(*seen, is_fixed=False) if is_lost else fit)
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
         with measure('profile'):
             most = self._matcher.num_disparities
@@ -199,7 +200,7 @@ class FloorSegmentation:
                 view, below, texture / enough, left_rows, heights, compared, noise, mask
             )
             mask = weighed(mask, self.likelihood.of(seen), seen.floor_px)
-            if not (is_fixed or fit.is_seen):
+            if not (is_fixed or fit.is_proved):
                 mask[mask == FLOOR] = NO_EVIDENCE
             clear_hidden(mask, moving, columns)
         with measure(DISPARITY_ABOVE):

@@ -22,12 +22,14 @@ def tilted(pitch_deg: float, roll_deg: float) -> Mount:
     )
 
 
-def scan_of(true: Mount, *patches: Patch) -> FloorScan:
-    """Return the scan of a camera that is said to sit on MOUNT; the map knows the tilt."""
+def scan_of(true: Mount, *patches: Patch, is_tracked: bool) -> FloorScan:
+    """Return the scan of a camera that is said to sit on MOUNT; while it is tracked the map knows
+    the tilt, else the image alone does.
+    """
     left, right, _, _ = Scene([*patches], CAMERA, true).render()
     stage = FloorSegmentation(CAMERA, FloorSegmentationSettings(robot_height_m=ROBOT_M))
     pose = true.T_base_left @ np.linalg.inv(MOUNT.T_base_left)
-    return stage.process(left, right, MOUNT, pose).scan
+    return stage.process(left, right, MOUNT, pose if is_tracked else None).scan
 
 
 def board(bottom_m: float) -> Patch:
@@ -39,14 +41,15 @@ def board(bottom_m: float) -> Patch:
 
 @pytest.mark.parametrize(('pitch_deg', 'roll_deg'), TILTS_DEG)
 @pytest.mark.parametrize(('bottom_m', 'is_in_the_way'), [(0.78, True), (0.93, False)])
+@pytest.mark.parametrize('is_tracked', [True, False])
 def test_what_hangs_over_the_way_is_as_high_as_the_plane_of_its_frame_says(
-    pitch_deg, roll_deg, bottom_m, is_in_the_way
+    pitch_deg, roll_deg, bottom_m, is_in_the_way, is_tracked
 ):
     """By the mount that is given the board would be 0.14 m higher or lower: on the other side of
     the robot's height.
     """
     true = tilted(pitch_deg, roll_deg)
-    scan = scan_of(true, floor_patch(), wall(4.0), board(bottom_m))
+    scan = scan_of(true, floor_patch(), wall(4.0), board(bottom_m), is_tracked=is_tracked)
     bearing = np.degrees(scan.bearings_rad)
     below = (bearing > -6) & (bearing < 22)
     at_board = np.abs(scan.obstacle_m * np.cos(scan.bearings_rad) - BOARD_M) < 0.15

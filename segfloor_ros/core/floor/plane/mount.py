@@ -49,7 +49,9 @@ from segfloor_ros.core.floor.plane.plane import (
     HEIGHT_RANGE_M,
     LEVEL_SIGMA,
     LOOKS,
+    PROPOSALS,
     SAMPLES,
+    SURE,
     SWAY,
     PlaneFit,
     Samples,
@@ -65,8 +67,8 @@ from segfloor_ros.core.geometry import Array, invert
 
 _USUAL = np.array([0.0, 0.0, 0.3])
 """Pitch, roll and height while nothing is known."""
-_PROPOSALS, _KEPT = 120, 40
-"""Guesses by the newest frame, and those that are kept for the next."""
+_KEPT = 40
+"""So many guesses are kept for the next frame."""
 _COMPARED = 6000
 """So many samples of all frames together are compared with a plane: neighbours err together."""
 _LEAST_SAMPLES = 20
@@ -78,8 +80,6 @@ _SIGMA = np.array([math.radians(0.8), math.radians(2.0), 0.03])
 """How well pitch, roll and height, as a share of it, must be known: the map is redone should they
 turn out to be others.
 """
-_SURE = 3.0
-"""Sigmas within which nearly all lies: guesses, or what is seen but once, are no surer."""
 _FLOOR_SLOPE = math.radians(1.5)
 """Floors on which robots start are level, more or less."""
 _TOLERANCE = np.array([math.radians(1.0), math.radians(1.0), 0.03])
@@ -330,7 +330,7 @@ class PlaneSearch:
             return None
         frames = self.frames = [*self._before, samples][-MAX_KEYFRAMES:]
         mean, sigma = prior
-        fresh = propose(samples, _PROPOSALS, self._rng, self._known)
+        fresh = propose(samples, PROPOSALS, self._rng, self._known)
         guesses = np.concatenate([self._guesses, fresh])
         if len(guesses) == 0:
             return None
@@ -338,7 +338,7 @@ class PlaneSearch:
         total = np.sum([scores(few, guesses) for few in some], axis=0)
         for few in _thinned(contrary):
             total += np.minimum(scores(few, guesses), 0)
-        total = np.maximum(total, 0) * preference(guesses, travel, mean, _SURE * sigma)
+        total = np.maximum(total, 0) * preference(guesses, travel, mean, SURE * sigma)
         order = np.argsort(-total, kind='stable')[:_KEPT]
         # Frames that show the same err together: the prior counts once per frame, too.
         sigma = sigma / math.sqrt(len(frames))

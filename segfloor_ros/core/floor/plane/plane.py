@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import OFFSET_SIGMA_PX, StereoCamera
 from segfloor_ros.core.contracts import Mount
-from segfloor_ros.core.floor.disparity.matching import NOISE_PX, SAME_PX
+from segfloor_ros.core.floor.disparity.matching import NOISE_PX, SAME_PX, SIGMAS
 from segfloor_ros.core.floor.disparity.profile import (
     HEIGHT_SIGMA,
     PITCH_SIGMA_RAD,
@@ -42,6 +42,8 @@ _BEND = 0.05
 _VIOLATION_WEIGHT = 1.5
 _CORRELATED_SAMPLES = 12.0
 """Neighbouring samples err together: so many count as one."""
+_NATS = 0.5 * SIGMAS**2 / _CORRELATED_SAMPLES
+"""Logarithm of a likelihood, of one in `scores`."""
 _SCALES_PX = (3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5)
 NEAR_SCALES_PX = (2.0, 1.5, 1.0, 0.7, 0.5, 0.5)
 FINER_SCALES_PX = NEAR_SCALES_PX[2:]
@@ -49,12 +51,10 @@ FINER_SCALES_PX = NEAR_SCALES_PX[2:]
 one that was refined by some of its samples."""
 _CLIMB, _SWAY_M = 0.03, 0.03
 """How far from parallel to the floor a camera travels: a slope, and what it sways."""
-_FAITH = 2.0
-"""So much more must speak for another expectation than for the camera as it is mounted."""
-_NOISE_SHARE = 0.01
-"""What so little of all that is seen speaks for is noise: the camera is as it is mounted."""
-_SWING_RAD = math.radians(3.0)
-"""So far robots swing on their wheels; what the map says beyond that is drift."""
+SURE = 3.0
+"""Sigmas within which nearly all lies."""
+PROPOSALS = 120
+"""So many planes are proposed at once."""
 _FLAT_WEIGHT = 0.1
 """Of samples whose disparity does not rise down the image as a floor's does."""
 _AT_ONCE = 200
@@ -147,17 +147,28 @@ wrong matches, is so small a share of that: of true floors 0.11 at most, of boar
 """
 
 
+_PROVED = math.log(20)
+"""Of planes with this evidence one in twenty is there by chance."""
+
+
 @dataclass(frozen=True)
 class PlaneFit:
     """A refined plane: angles_height (3,) = pitch_rad, roll_rad, height_m of the camera;
     sigma (3,) of them; support: share of the weight of the samples below the plane's horizon
-    that lies on it; violations: share that lies below it.
+    that lies on it; violations: share that lies below it. evidence: of the plane of a frame, the
+    logarithm of how much likelier all that is seen is with it than without.
     """
 
     angles_height: Array
     sigma: Array
     support: float
     violations: float
+    evidence: float = math.nan
+
+    @property
+    def is_proved(self) -> bool:
+        """Whether what is seen proves that the plane of a frame is there."""
+        return self.evidence > _PROVED
 
     @property
     def is_seen(self) -> bool:
@@ -166,21 +177,31 @@ class PlaneFit:
 
 
 class Fixture:
-    """Whether the camera is fixed to its base: then the planes of all frames lie equally far below
-    it. problem: in words, once they do not. A hand does not hold a camera like that.
+    """What the planes of frames say of how the camera is fixed to its base. problem: in words, once
+    their heights vary by more than robots sway: a hand does not hold a camera like that.
     """
 
     def __init__(self) -> None:
         self.problem: str | None = None
-        self._heights_m: list[float] = []
+        self._planes: list[Array] = []
+
+    def usual(self, mounted: Array) -> Array:
+        """Return pitch, roll and height (1, 3) of the camera in most frames, where that is not how
+        it is mounted (3,); (0, 3) where it is, and while few frames were seen.
+        """
+        usual = np.median(self._planes or [mounted], axis=0)
+        off = np.abs(usual - mounted) / (1.0, 1.0, mounted[2])
+        is_other = len(self._planes) >= LOOKS and (off > SURE * np.array(SWAY)).any()
+        return usual[None] if is_other else np.zeros((0, 3))
 
     def note(self, fit: PlaneFit) -> None:
         """Take in the plane of a frame."""
-        if not fit.is_seen:
+        if not (fit.is_proved and fit.is_seen):
             return
-        self._heights_m.append(float(fit.angles_height[2]))
-        low, minus, middle, plus, high = np.percentile(self._heights_m, _INTERVAL_PERCENT)
-        if len(self._heights_m) >= LOOKS and plus - minus > 2 * SWAY[2] * middle:
+        self._planes.append(fit.angles_height)
+        heights_m = np.array(self._planes)[:, 2]
+        low, minus, middle, plus, high = np.percentile(heights_m, _INTERVAL_PERCENT)
+        if len(heights_m) >= LOOKS and plus - minus > 2 * SWAY[2] * middle:
             self.problem = (
                 'the camera is not fixed to its base: its height above the floor varies by '
                 f'{high - low:.2f} m; fix it. There is floor only where an image shows its plane'
@@ -355,18 +376,16 @@ def _add_travel(information: Array, gradient: Array, state: Array, travel: Array
 
 
 def texture_weight(texture: NDArray[np.floating], enough: float) -> Array:
-    """Return how much disparities count where the image has some texture, in [0, 1]. enough: what
-    is no noise; clearly more is needed for a plane.
+    """Return how much disparities count, in [0, 1]: their variance falls with the square of the
+    texture. enough: texture that is no noise; clearly more is needed for a plane.
     """
-    grey = texture.astype(np.float64) / (4 * enough)
-    grey *= grey
-    grey *= grey
-    weight: Array = grey / (grey + 1)
+    square = (texture / (2.0 * enough)) ** 2
+    weight: Array = square / (square + 1.0)
     return weight
 
 
 def expectations(mount: Mount, T_map_base: Array | None) -> Array:
-    """Return what pitch, roll and height to expect of a frame, (P, 3), the likeliest first.
+    """Return what pitch, roll and height to expect of a frame, (P, 3).
 
     As the camera is mounted; or, should the robot pitch or roll on its wheels, level in the map;
     or, of a camera in a hand, as high as it is in the map.
@@ -389,7 +408,8 @@ def plane_of_frame(
     expected: Array,
     is_fixed: bool = True,
 ) -> PlaneFit:
-    """Return the plane of the floor in a frame, in its own camera's axes.
+    """Return the plane of the floor in a frame, in its own camera's axes: the likeliest by what is
+    seen and what is expected.
 
     disparity, texture: (R, W) from `first_row` on, every `column_step` columns. enough: texture
     that is no noise. expected: (P, 3), as of `expectations`. is_fixed: the camera to its base.
@@ -405,28 +425,69 @@ def plane_of_frame(
     uv_px = np.stack([columns * across, rows * step + first_row], axis=1).astype(np.float64)
     found_px = part[rows, columns].astype(np.float64)
     samples = Samples.of(camera, uv_px, found_px, weight)
-    expected = np.vstack([expected, swung(expected[0], 2 * SAME_PX / camera.fy / slope)])
-    share = scores(samples, expected) / max(samples.weight.sum(), 1e-9)
-    start = expected[likeliest(share, expected) if is_fixed else int(np.argmax(share))]
-    sigma = np.array([*2 * [PITCH_SIGMA_RAD], HEIGHT_SIGMA * start[2]])
+    prior = FramePrior.of(expected, is_fixed)
+    guesses = [prior.means[0]]
+    if weight.sum() > 0:
+        guesses.append(_likeliest(samples, prior))
+    fits = [_refined(samples, guess, prior) for guess in guesses]
+    return max(fits, key=lambda fit: fit.evidence)
+
+
+@dataclass(frozen=True)
+class FramePrior:
+    """What pitch, roll and height to expect of a frame: a mixture of Gaussians with these means and
+    standard deviations, (P, 3) each. The first one is the camera as it is mounted.
+    """
+
+    means: Array
+    sigmas: Array
+    most: float
+
+    @classmethod
+    def of(cls, expected: Array, is_fixed: bool) -> FramePrior:
+        """Return that of a base that stands still, or sways about what is expected (P, 3)."""
+        still = (PITCH_SIGMA_RAD, PITCH_SIGMA_RAD, HEIGHT_SIGMA)
+        means = np.vstack([expected[0], expected])
+        sigmas = np.vstack([still, np.tile(SWAY, (len(expected), 1))])
+        sigmas[:, 2] *= means[:, 2]
+        return cls(means, sigmas, SURE if is_fixed else math.inf)
+
+    def log_density(self, angles_height: Array) -> Array:
+        """Return the logarithms of the density of each component (M, P) at planes (M, 3)."""
+        off = (angles_height[:, None] - self.means) / self.sigmas
+        density = -0.5 * (off**2).sum(axis=2) - np.log(self.sigmas).sum(axis=1)
+        density[(np.abs(off) > self.most).any(axis=2)] = -math.inf
+        return density - 1.5 * math.log(2 * math.pi)
+
+
+def _likeliest(samples: Samples, prior: FramePrior) -> Array:
+    """Return the likeliest plane (3,) of those that are drawn from the prior, half of them raised
+    or lowered such that a sample lies on them. samples: at least one.
+    """
+    rng = np.random.default_rng(0)
+    of = rng.integers(len(prior.means), size=2 * PROPOSALS)
+    drawn = rng.normal(prior.means[of], prior.sigmas[of])
+    weight = samples.weight / samples.weight.sum()
+    on = rng.choice(len(weight), size=PROPOSALS, p=weight)
+    unit = plane_of(np.column_stack([drawn[: len(on), :2], np.ones(len(on))]))
+    depth_m = samples.disparity_m / samples.disparity_px[on]
+    drawn[: len(on), 2] = -depth_m * (unit * samples.rays[on]).sum(axis=1)
+    guesses = np.vstack([prior.means, drawn])
+    guesses = guesses[plausible(guesses)]
+    likelihood = _NATS * scores(samples.every(int(_CORRELATED_SAMPLES)), guesses)
+    best: Array = guesses[np.argmax(likelihood + prior.log_density(guesses).max(axis=1))]
+    return best
+
+
+def _refined(samples: Samples, guess: Array, prior: FramePrior) -> PlaneFit:
+    """Return a plane (3,) refined, with its evidence by Laplace's approximation: Bishop, Pattern
+    Recognition and Machine Learning, 2006, section 4.4.1.
+    """
+    nearest = int(np.argmax(prior.log_density(guess[None])))
+    mean, sigma = prior.means[nearest], prior.sigmas[nearest]
     unknown, still = np.full(3, np.nan), np.zeros((0, 3))
-    return refine(samples, start, unknown, still, start, sigma, NEAR_SCALES_PX)
-
-
-def swung(angles_height: Array, step_rad: float) -> Array:
-    """Return a camera's pitch, roll and height (N, 3) as its base swings over a bump, in steps of
-    its pitch of at most so much.
-    """
-    steps = max(1, math.ceil(_SWING_RAD / step_rad))
-    angles_rad = np.delete(np.linspace(-_SWING_RAD, _SWING_RAD, 2 * steps + 1), steps)
-    return angles_height + np.outer(angles_rad, (1.0, 0.0, 0.0))
-
-
-def likeliest(share: Array, expected: Array) -> int:
-    """Return which expectation, of pitch, roll and height (P, 3), to start from, by the share (P,)
-    of all that is seen that speaks for each, less what speaks against it.
-    """
-    swing = np.hypot(*(expected - expected[0])[:, :2].T)
-    likelihood = share * np.exp(-0.5 * (swing / _SWING_RAD) ** 2)
-    likelihood[0] = max(_FAITH * share[0], _NOISE_SHARE)
-    return int(np.argmax(likelihood))
+    fit = refine(samples, guess, unknown, still, mean, sigma, NEAR_SCALES_PX)
+    plane = fit.angles_height[None]
+    volume = np.log(fit.sigma).sum() + 1.5 * math.log(2 * math.pi)
+    likelihood = _NATS * scores(samples, plane)[0]
+    return replace(fit, evidence=float(likelihood + prior.log_density(plane).max() + volume))
