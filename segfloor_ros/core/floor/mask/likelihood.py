@@ -28,20 +28,20 @@ from segfloor_ros.core.floor.disparity.profile import STEP_PX
 Picture = NDArray[np.float32]
 
 WEIGHTS = {
-    'one': 0.80,
-    'above': -0.06,
+    'one': 0.83,
+    'above': -0.10,
     'below': 0.35,
-    'rises': 1.02,
-    'steep': -1.50,
-    'on': 2.50,
-    'off': -0.99,
-    'matched': -2.33,
-    'cost': -0.10,
-    'overhead': -0.30,
-    'look': 0.72,
-    'dark': -0.27,
-    'bright': -1.00,
-    'shared': -0.24,
+    'rises': 0.93,
+    'steep': -1.36,
+    'on': 2.56,
+    'off': -1.13,
+    'matched': -2.85,
+    'cost': -0.12,
+    'overhead': -0.35,
+    'look': 0.82,
+    'dark': -0.15,
+    'bright': -0.98,
+    'shared': -0.18,
 }
 """By feature, made by `tools/fit_floor.py`.
 
@@ -55,7 +55,7 @@ often it is seen. dark, bright: by how many sigmas more than two it is darker, b
 floor. shared: whether the right camera sees it.
 """
 
-PASSED_ON = 0.42, 0.84, 1.68
+PASSED_ON = 0.47, 0.86, 1.67
 """What a pixel has of itself, and of what is passed on to it: a constant, and weights."""
 
 _SURE, _LIKELY, _UNLIKELY = (math.log(p / (1 - p)) for p in (0.95, 0.75, 0.4))
