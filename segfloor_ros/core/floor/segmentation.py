@@ -72,7 +72,7 @@ from segfloor_ros.core.floor.mask.pixel_evidence import (
     texture_grey,
     unlike_floor,
 )
-from segfloor_ros.core.floor.plane.plane import Fixture, expectations, plane_of_frame
+from segfloor_ros.core.floor.plane.plane import PROVED, Fixture, expectations, plane_of_frame
 from segfloor_ros.core.floor.scan import FloorScanner, OverheadMatcher
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.geometry import Array
@@ -162,7 +162,8 @@ class FloorSegmentation:
             is_fixed = self.fixture.problem is None
             seen = self._camera, first_row, below, texture, enough, expected
             fit = plane_of_frame(*seen, is_fixed)
-            is_lost = is_fixed and not fit.is_proved
+            is_proved = fit.evidence > PROVED
+            is_lost = is_fixed and not is_proved
             self.fixture.note(plane_of_frame(*seen, is_fixed=False) if is_lost else fit)
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
         with measure('profile'):
@@ -189,7 +190,7 @@ class FloorSegmentation:
             mask = self._fill(
                 view, profile, below, evidence, left_rows, textured, compared, below_said
             )
-            if not (is_fixed or fit.is_proved):
+            if not (is_fixed or is_proved):
                 mask[mask == FLOOR] = NO_EVIDENCE
             clear_hidden(mask, moving, columns)
         with measure(DISPARITY_ABOVE):
