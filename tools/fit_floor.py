@@ -33,6 +33,7 @@ from segfloor_ros.core.floor.mask.likelihood import (
     Picture,
     Seen,
     features,
+    known_weight,
     passed_on,
 )
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
@@ -137,7 +138,9 @@ def scored_frames(
         drawn = [np.flatnonzero(counts & ((label == TRUE_FLOOR) == kind)) for kind in (True, False)]
         drawn = [rng.choice(at, min(PIXELS, len(at)), replace=False) for at in drawn if len(at)]
         at = np.concatenate(drawn)
-        found.append(Frame(features(seen), seen, at, label.ravel()[at] == TRUE_FLOOR))
+        found.append(
+            Frame(features(seen, known_weight(seen)), seen, at, label.ravel()[at] == TRUE_FLOOR)
+        )
     return found
 
 

@@ -49,6 +49,7 @@ from segfloor_ros.core.floor.mask.filling import (
     NetworkFloor,
     beside_something,
     blank_feet,
+    drop_islands,
     fill_gaps,
     fill_regions,
     image_slope,
@@ -79,7 +80,7 @@ from segfloor_ros.core.floor.mask.pixel_evidence import (
     texture_grey,
     unlike_floor,
 )
-from segfloor_ros.core.floor.plane.plane import Fixture, expectations, plane_of_frame
+from segfloor_ros.core.floor.plane.plane import PROVED, Fixture, expectations, plane_of_frame
 from segfloor_ros.core.floor.scan import FloorScanner, OverheadMatcher
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.geometry import Array
@@ -170,7 +171,8 @@ class FloorSegmentation:
             is_fixed = self.fixture.problem is None
             seen = self._camera, first_row, below, texture, enough, expected
             fit = plane_of_frame(*seen, is_fixed)
-            is_lost = is_fixed and not fit.is_proved
+            is_proved = fit.evidence > PROVED
+            is_lost = is_fixed and not is_proved
             self.fixture.note(plane_of_frame(*seen, is_fixed=False) if is_lost else fit)
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
         with measure('profile'):
@@ -186,7 +188,9 @@ class FloorSegmentation:
                 compared = compare_measured(view, profile, below, on_floor, NOISE_PX)
         with measure('evidence'):
             left_view = left[columns]
-            evidence = _evidence(view, below, left_view, texture, enough, compared, heights)
+            evidence = _evidence(
+                view, below, left_view, texture, enough, compared, heights, self._settings
+            )
             clear_hidden(evidence.mask, moving, columns)
             below_said = None if said is None else said[columns]
             if below_said is not None:
@@ -199,8 +203,8 @@ class FloorSegmentation:
             seen = self._seen(
                 view, below, texture / enough, left_rows, heights, compared, noise, mask
             )
-            mask = weighed(mask, self.likelihood.of(seen), seen.floor_px)
-            if not (is_fixed or fit.is_proved):
+            mask = drop_islands(weighed(mask, self.likelihood.of(seen), seen.floor_px))
+            if not (is_fixed or is_proved):
                 mask[mask == FLOOR] = NO_EVIDENCE
             clear_hidden(mask, moving, columns)
         with measure(DISPARITY_ABOVE):
@@ -323,21 +327,24 @@ class FloorSegmentation:
         said: NDArray[np.uint8] | None,
     ) -> NDArray[np.uint8]:
         """Return the mask with floor where this pair of images alone cannot tell: where it looks
-        like floor. What then does not look like it is floor only if it was measured. Nor does it
-        contradict a network that was right so far.
+        like floor. The more floor is known the better is known how it looks, so this is done twice,
+        and what then does not look like it is floor only if it was measured. Nor does it contradict
+        a network that was right so far.
         """
         mask, odd = evidence.mask, evidence.odd
         beside = beside_something(view, mask)
         left = np.ascontiguousarray(left_rows[:, :: view.step])
         slope = image_slope(left_rows)
         upright_px = upright_above(view, disparity, compared, textured)
-        mask = fill_regions(
-            view, mask, slope, upright_px, compared, textured, evidence.standing, beside, odd
-        )
-        may_be = compared.consistent & ~compared.denied & ~(beside | odd)
-        mask = fill_gaps(view, profile, mask, may_be)
-        unlike = unlike_floor(left, mask == FLOOR)
-        mask = without_floor(mask, unlike & evidence.off & textured)
+        for _ in range(2):
+            mask = fill_regions(
+                view, mask, slope, upright_px, compared, textured, evidence.standing, beside, odd
+            )
+            may_be = compared.consistent & ~compared.denied & ~(beside | odd)
+            mask = fill_gaps(view, profile, mask, may_be)
+            unlike = unlike_floor(left, mask == FLOOR)
+            odd = unlike & (evidence.off | evidence.odd)
+            mask = without_floor(mask, unlike & evidence.off & textured)
         if said is not None:
             self.network.note(said, mask)
         if said is not None and self.network.is_trusted:
@@ -392,11 +399,12 @@ def _evidence(
     enough: float,
     compared: Comparison,
     heights: Heights,
+    settings: FloorSegmentationSettings,
 ) -> Evidence:
     """Return what the pixels (R, W) of the view say by themselves, cut back to edges, and left
     open where they do not look like floor and are not measured to lie on it.
     """
-    mask = judge(view, below, texture > enough, compared, heights)
+    mask = judge(view, below, texture > enough, compared, heights, settings)
     seen = trim_to_edges(mask, row_slope(left), TEXTURE_WINDOW_PX // 2 + 3)
     odd, sigmas = unlike_floor(left, seen == FLOOR), mean_height(heights)
     off, standing = np.abs(sigmas) > SIGMAS * MEAN_NOISE, sigmas > SIGMAS

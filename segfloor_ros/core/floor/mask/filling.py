@@ -26,7 +26,7 @@ from segfloor_ros.core.floor.disparity.profile import (
     pixels_where,
     surface_above,
 )
-from segfloor_ros.core.floor.mask.likelihood import enlarged, with_floor
+from segfloor_ros.core.floor.mask.likelihood import enlarged, with_floor, without_floor
 from segfloor_ros.core.floor.mask.pixel_evidence import EDGE_SLOPE, Comparison, below_floor
 
 _MIN_REGION_PX = 15
@@ -34,6 +34,8 @@ _MIN_COLUMNS = 0.3
 """Part of the columns of a region that must show floor for it to be filled."""
 _GAP_M = 0.5
 """Gaps of this size between floor pixels are filled where nothing speaks against it."""
+_ISLAND_SHARE = 0.05
+"""Patches of floor smaller than this share of the largest are dropped."""
 _MIN_SLOPE = 1.5
 """Grey levels per pixel at half resolution; weaker edges bound no region."""
 _STRONG_SLOPE = 10.0
@@ -191,6 +193,16 @@ def fill_gaps(
     between &= (gaps.after(mask, NO_EVIDENCE) == FLOOR) | at_border
     across = np.minimum(gaps.stop, width - 1) - gaps.first + 1
     return with_floor(mask, gaps.painted(between & (across <= longest[gaps.row])) & consistent)
+
+
+def drop_islands(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the mask without patches of floor smaller than a share of the largest."""
+    small = (mask[::STEP_PX, ::STEP_PX] == FLOOR).astype(np.uint8)
+    count, label, stats, _ = cv2.connectedComponentsWithStats(small, connectivity=8)
+    if count < 3:
+        return mask
+    area = stats[:, cv2.CC_STAT_AREA]
+    return without_floor(mask, enlarged((area < _ISLAND_SHARE * area[1:].max())[label], mask))
 
 
 def trim_to_edges(

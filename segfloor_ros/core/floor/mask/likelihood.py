@@ -134,10 +134,17 @@ class Seen:
     is_floor: NDArray[np.bool_]
 
 
-def features(seen: Seen) -> Picture:
-    """Return the features (F, h, w) of all pixels, in the order of `WEIGHTS`."""
+def known_weight(seen: Seen) -> Picture:
+    """Return how well the disparity of each pixel is known (h, w), in [0, 1]."""
+    weight: Picture = np.clip(2 * seen.texture - 1, 0, 1) * _certainty(seen)
+    return weight * (seen.disparity_px > 0)
+
+
+def features(seen: Seen, weight: Picture) -> Picture:
+    """Return the features (F, h, w) of all pixels, in the order of `WEIGHTS`. weight: as of
+    `known_weight`.
+    """
     known = (seen.disparity_px > 0).astype(np.float32)
-    weight = np.clip(2 * seen.texture - 1, 0, 1) * _certainty(seen) * known
     one = np.ones_like(known)
     height, mostly_on = _local_height(seen, weight, known)
     rises = _rise(seen, weight, known)
@@ -349,10 +356,13 @@ def _along(values: Picture, kept: Picture) -> Picture:
 
 @dataclass(frozen=True)
 class Likely:
-    """Log-likelihood ratios of floor: of each pixel by itself, and with what is around it."""
+    """Log-likelihood ratios of floor: of each pixel by itself, and with what is around it.
+    measured: where the disparities around it say anything.
+    """
 
     alone: Picture
     together: Picture
+    measured: NDArray[np.bool_]
 
 
 class Likelihood:
@@ -370,11 +380,13 @@ class Likelihood:
 
     def of(self, seen: Seen) -> Likely:
         """Return how likely each pixel is floor; what is about as far as the horizon is not."""
-        alone = self.alone(features(seen))
+        weight = known_weight(seen)
+        alone = self.alone(features(seen, weight))
         alone = np.where(seen.floor_px > SAME_PX, alone, np.float32(-_MOST_ALONE))
-        constant, own, weight = self.combined
+        constant, own, share = self.combined
         around = passed_on(alone, seen.grey, seen.noise_grey)
-        return Likely(alone, constant + own * alone + weight * around)
+        together = constant + own * alone + share * around
+        return Likely(alone, together, cv2.blur(weight, _WIDE) > _LEAST_KNOWN)
 
     def alone(self, parts: Picture) -> Picture:
         """Return the log-likelihood ratio of floor of pixels by their features (F, ...) alone."""
@@ -383,12 +395,12 @@ class Likelihood:
 
 
 def weighed(mask: NDArray[np.uint8], likely: Likely, floor_px: Picture) -> NDArray[np.uint8]:
-    """Return a mask (R, W) without floor that is not likely, and with what is surely floor. It is
-    unlikely where neither the pixel by itself nor what is around it speaks for it; and where
-    nothing is known it is sure where both do.
+    """Return a mask (R, W) without floor that is not likely, and with what is surely floor, where
+    that is measured. floor_px: (h, w), disparity of the floor.
     """
-    unlikely = (likely.alone < _UNLIKELY) & (likely.together < 0)
-    sure = (likely.together > _SURE) & (likely.alone > _LIKELY) & (floor_px > LEAST_FLOOR_PX)
+    judged = likely.measured & (floor_px > LEAST_FLOOR_PX)
+    unlikely = judged & (likely.alone < _UNLIKELY) & (likely.together < 0)
+    sure = judged & (likely.alone > _LIKELY) & (likely.together > _SURE)
     return with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))
 
 

@@ -179,6 +179,7 @@ def judge(
     textured: NDArray[np.bool_],
     compared: Comparison,
     heights: Heights,
+    settings: FloorSegmentationSettings,
 ) -> NDArray[np.uint8]:
     """Return what the pixels (R, W) of the view say by themselves, the mask of `Evidence`.
 
@@ -197,6 +198,11 @@ def judge(
     low = above & sure & (heights.height < up + np.float32(_CONTACT_HEIGHT_M))
     mask[_below_contact(view, table.row, heights.index, low)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
+    # On a sill the images contradict the floor, and show that it is a sill; beyond it floor goes on
+    # where above a foot there is what stands on it.
+    step_m = np.float32(settings.step_height_m)
+    sill = compared.against & (np.abs(heights.height) <= step_m)
+    mask[may_be & sill & below_floor(mask)] = FLOOR
     mask[
         (mask == FLOOR) & ~most_around(mask == FLOOR, textured & near & (off | (mask == FLOOR)))
     ] = NO_EVIDENCE

@@ -147,7 +147,7 @@ wrong matches, is so small a share of that: of true floors 0.11 at most, of boar
 """
 
 
-_PROVED = math.log(20)
+PROVED = math.log(20)
 """Of planes with this evidence one in twenty is there by chance."""
 
 
@@ -164,11 +164,6 @@ class PlaneFit:
     support: float
     violations: float
     evidence: float = math.nan
-
-    @property
-    def is_proved(self) -> bool:
-        """Whether what is seen proves that the plane of a frame is there."""
-        return self.evidence > _PROVED
 
     @property
     def is_seen(self) -> bool:
@@ -196,7 +191,7 @@ class Fixture:
 
     def note(self, fit: PlaneFit) -> None:
         """Take in the plane of a frame."""
-        if not (fit.is_proved and fit.is_seen):
+        if not (fit.evidence > PROVED and fit.is_seen):
             return
         self._planes.append(fit.angles_height)
         heights_m = np.array(self._planes)[:, 2]
@@ -257,14 +252,9 @@ def scores(samples: Samples, angles_height: Array) -> Array:
     for start in range(0, len(samples.weight), _AT_ONCE):
         part = samples.take(slice(start, start + _AT_ONCE))
         error, limit, visible = _seen(part, planes)
-        below = error < limit
-        against = np.multiply(error, np.float32(1 / SAME_PX), out=error)
-        np.multiply(against, against, out=against)
-        np.minimum(against, 1, out=against)
-        against += np.multiply(below, np.float32(_VIOLATION_WEIGHT), out=limit)
-        against -= 1
-        against *= visible
-        total -= part.weight @ against
+        below = np.float32(_VIOLATION_WEIGHT) * (error < limit)
+        on = 1 - np.minimum((error / np.float32(SAME_PX)) ** 2, 1)
+        total += part.weight @ ((on - below) * visible)
     return total
 
 
@@ -351,13 +341,8 @@ def _normal_equations(samples: Samples, state: Array, scale: float) -> tuple[Arr
     by_state = -samples.disparity_m * _jacobian(state)
     expected = samples.rays @ (-state[2] * by_state[:, 2])
     error = samples.disparity_px - expected
-    biweight = error * error
-    biweight *= -1 / (4 * scale**2)
-    biweight += 1
-    np.maximum(biweight, 0, out=biweight)
-    weight = samples.weight_on(plane_of(state)) * (expected > SAME_PX)
-    weight *= biweight
-    weight *= biweight
+    biweight = np.maximum(1 - (error / (2 * scale)) ** 2, 0)
+    weight = samples.weight_on(plane_of(state)) * (expected > SAME_PX) * biweight**2
     weight /= _CORRELATED_SAMPLES * NOISE_PX**2
     weighted = samples.rays.T * weight
     information = by_state.T @ (weighted @ samples.rays) @ by_state
@@ -373,15 +358,6 @@ def _add_travel(information: Array, gradient: Array, state: Array, travel: Array
     rows = scaled @ _jacobian(unit)[:, :2]
     information[:2, :2] += rows.T @ rows
     gradient[:2] -= rows.T @ (scaled @ plane_of(unit))
-
-
-def texture_weight(texture: NDArray[np.floating], enough: float) -> Array:
-    """Return how much disparities count, in [0, 1]: their variance falls with the square of the
-    texture. enough: texture that is no noise; clearly more is needed for a plane.
-    """
-    square = (texture / (2.0 * enough)) ** 2
-    weight: Array = square / (square + 1.0)
-    return weight
 
 
 def expectations(mount: Mount, T_map_base: Array | None) -> Array:
@@ -420,58 +396,52 @@ def plane_of_frame(
     across = step * column_step(camera)
     slope = FloorLine.of(camera, Mount(height_m=expected[0, 2], pitch_rad=expected[0, 0])).slope
     inclined = rising(disparity[:, ::step], slope)[::step][rows, columns]
-    weight = texture_weight(texture[::step, ::step][rows, columns], enough)
-    weight *= np.where(inclined, 1.0, _FLAT_WEIGHT)
+    # The variance of a disparity falls with the square of its texture; a plane needs clearly some.
+    square = (texture[::step, ::step][rows, columns] / (2.0 * enough)) ** 2
+    weight = square / (square + 1.0) * np.where(inclined, 1.0, _FLAT_WEIGHT)
     uv_px = np.stack([columns * across, rows * step + first_row], axis=1).astype(np.float64)
     found_px = part[rows, columns].astype(np.float64)
     samples = Samples.of(camera, uv_px, found_px, weight)
-    prior = FramePrior.of(expected, is_fixed)
-    guesses = [prior.means[0]]
-    if weight.sum() > 0:
-        guesses.append(_likeliest(samples, prior))
-    fits = [_refined(samples, guess, prior) for guess in guesses]
-    return max(fits, key=lambda fit: fit.evidence)
+    prior = FramePrior(expected, is_fixed)
+    fit = _refined(samples, _likeliest(samples, prior), prior)
+    # What is refined may leave what is expected.
+    return fit if fit.evidence > -math.inf else _refined(samples, prior.means[0], prior)
 
 
-@dataclass(frozen=True)
 class FramePrior:
-    """What pitch, roll and height to expect of a frame: a mixture of Gaussians with these means and
-    standard deviations, (P, 3) each. The first one is the camera as it is mounted.
+    """What pitch, roll and height to expect of a frame: a mixture of Gaussians, of a base that
+    stands still, or sways about what is expected (P, 3). means, sigmas: (P + 1, 3) each.
     """
 
-    means: Array
-    sigmas: Array
-    most: float
-
-    @classmethod
-    def of(cls, expected: Array, is_fixed: bool) -> FramePrior:
-        """Return that of a base that stands still, or sways about what is expected (P, 3)."""
+    def __init__(self, expected: Array, is_fixed: bool) -> None:
         still = (PITCH_SIGMA_RAD, PITCH_SIGMA_RAD, HEIGHT_SIGMA)
-        means = np.vstack([expected[0], expected])
-        sigmas = np.vstack([still, np.tile(SWAY, (len(expected), 1))])
-        sigmas[:, 2] *= means[:, 2]
-        return cls(means, sigmas, SURE if is_fixed else math.inf)
+        self.means = np.vstack([expected[0], expected])
+        self.sigmas = np.vstack([still, *len(expected) * [SWAY]])
+        self.sigmas[:, 2] *= self.means[:, 2]
+        self._most = SURE if is_fixed else math.inf
 
     def log_density(self, angles_height: Array) -> Array:
-        """Return the logarithms of the density of each component (M, P) at planes (M, 3)."""
+        """Return the logarithms of the density of each component (M, P + 1) at planes (M, 3)."""
         off = (angles_height[:, None] - self.means) / self.sigmas
         density = -0.5 * (off**2).sum(axis=2) - np.log(self.sigmas).sum(axis=1)
-        density[(np.abs(off) > self.most).any(axis=2)] = -math.inf
+        density[(np.abs(off) > self._most).any(axis=2)] = -math.inf
         return density - 1.5 * math.log(2 * math.pi)
 
 
 def _likeliest(samples: Samples, prior: FramePrior) -> Array:
     """Return the likeliest plane (3,) of those that are drawn from the prior, half of them raised
-    or lowered such that a sample lies on them. samples: at least one.
+    or lowered such that a sample lies on them; as the camera is mounted, where nothing is seen.
     """
-    rng = np.random.default_rng(0)
+    total, rng = samples.weight.sum(), np.random.default_rng(0)
+    if total == 0:
+        return prior.means[0]
     of = rng.integers(len(prior.means), size=2 * PROPOSALS)
     drawn = rng.normal(prior.means[of], prior.sigmas[of])
-    weight = samples.weight / samples.weight.sum()
-    on = rng.choice(len(weight), size=PROPOSALS, p=weight)
-    unit = plane_of(np.column_stack([drawn[: len(on), :2], np.ones(len(on))]))
+    on = rng.choice(len(samples.weight), size=PROPOSALS, p=samples.weight / total)
+    raised = drawn[:PROPOSALS]
+    raised[:, 2] = 1.0
     depth_m = samples.disparity_m / samples.disparity_px[on]
-    drawn[: len(on), 2] = -depth_m * (unit * samples.rays[on]).sum(axis=1)
+    raised[:, 2] = -depth_m * (plane_of(raised) * samples.rays[on]).sum(axis=1)
     guesses = np.vstack([prior.means, drawn])
     guesses = guesses[plausible(guesses)]
     likelihood = _NATS * scores(samples.every(int(_CORRELATED_SAMPLES)), guesses)
@@ -483,11 +453,11 @@ def _refined(samples: Samples, guess: Array, prior: FramePrior) -> PlaneFit:
     """Return a plane (3,) refined, with its evidence by Laplace's approximation: Bishop, Pattern
     Recognition and Machine Learning, 2006, section 4.4.1.
     """
-    nearest = int(np.argmax(prior.log_density(guess[None])))
-    mean, sigma = prior.means[nearest], prior.sigmas[nearest]
+    nearest = np.argmax(prior.log_density(guess[None]))
+    expected = prior.means[nearest], prior.sigmas[nearest]
     unknown, still = np.full(3, np.nan), np.zeros((0, 3))
-    fit = refine(samples, guess, unknown, still, mean, sigma, NEAR_SCALES_PX)
+    fit = refine(samples, guess, unknown, still, *expected, NEAR_SCALES_PX)
     plane = fit.angles_height[None]
-    volume = np.log(fit.sigma).sum() + 1.5 * math.log(2 * math.pi)
-    likelihood = _NATS * scores(samples, plane)[0]
-    return replace(fit, evidence=float(likelihood + prior.log_density(plane).max() + volume))
+    evidence = _NATS * scores(samples, plane)[0] + prior.log_density(plane).max()
+    evidence += np.log(fit.sigma).sum() + 1.5 * math.log(2 * math.pi)
+    return replace(fit, evidence=float(evidence))

@@ -10,7 +10,13 @@ from floor_scenes import CAMERA, MOUNT, SMALL_CAMERA, Patch, Scene, box, floor_p
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR, Mount
 from segfloor_ros.core.floor.disparity.profile import FloorLine, column_step
-from segfloor_ros.core.floor.plane.plane import Fixture, PlaneFit, expectations, plane_of_frame
+from segfloor_ros.core.floor.plane.plane import (
+    PROVED,
+    Fixture,
+    PlaneFit,
+    expectations,
+    plane_of_frame,
+)
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
@@ -139,7 +145,7 @@ def test_noise_proves_no_plane():
         noise = rng.uniform(1, 40, shape).astype(np.float32)
         for is_fixed in (True, False):
             fit = fit_to(SMALL_CAMERA, noise, is_fixed=is_fixed, texture=texture)
-            assert not fit.is_proved
+            assert not fit.evidence > PROVED
 
 
 def seen_at(height_m: float, pitch_deg: float = 7.0, evidence: float = 50.0) -> PlaneFit:
