@@ -27,6 +27,7 @@ from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.floor.disparity.matching import SAME_PX
 from segfloor_ros.core.floor.disparity.profile import STEP_PX
 from segfloor_ros.core.floor.mask.likelihood import (
+    LEAST_KNOWN,
     WEIGHTS,
     Likelihood,
     Likely,
@@ -132,15 +133,16 @@ def scored_frames(
         seen = recorder.seen
         part = np.s_[seen.first_row :: STEP_PX, ::STEP_PX]
         label = frame.truth.label[part]
-        counts = (label != UNKNOWN) & (seen.floor_px > SAME_PX)
+        weight = known_weight(seen)
+        counts = (label != UNKNOWN) & (seen.floor_px > SAME_PX) & (weight > LEAST_KNOWN)
         if frame.moving is not None:
             counts &= frame.moving[part] == 0
         drawn = [np.flatnonzero(counts & ((label == TRUE_FLOOR) == kind)) for kind in (True, False)]
         drawn = [rng.choice(at, min(PIXELS, len(at)), replace=False) for at in drawn if len(at)]
+        if not drawn:
+            continue
         at = np.concatenate(drawn)
-        found.append(
-            Frame(features(seen, known_weight(seen)), seen, at, label.ravel()[at] == TRUE_FLOOR)
-        )
+        found.append(Frame(features(seen, weight), seen, at, label.ravel()[at] == TRUE_FLOOR))
     return found
 
 

@@ -28,20 +28,20 @@ from segfloor_ros.core.floor.disparity.profile import STEP_PX
 Picture = NDArray[np.float32]
 
 WEIGHTS = {
-    'one': 0.83,
-    'above': -0.10,
-    'below': 0.35,
-    'rises': 0.93,
-    'steep': -1.36,
-    'on': 2.56,
-    'off': -1.13,
-    'matched': -2.85,
-    'cost': -0.12,
-    'overhead': -0.35,
-    'look': 0.82,
-    'dark': -0.15,
-    'bright': -0.98,
-    'shared': -0.18,
+    'one': 0.50,
+    'above': -0.31,
+    'below': 0.25,
+    'rises': 0.70,
+    'steep': -1.44,
+    'on': 2.33,
+    'off': -0.32,
+    'matched': -1.14,
+    'cost': -0.05,
+    'overhead': -0.24,
+    'look': 0.73,
+    'dark': -0.28,
+    'bright': -0.54,
+    'shared': 0.45,
 }
 """By feature, made by `tools/fit_floor.py`.
 
@@ -55,7 +55,7 @@ often it is seen. dark, bright: by how many sigmas more than two it is darker, b
 floor. shared: whether the right camera sees it.
 """
 
-PASSED_ON = 0.47, 0.86, 1.67
+PASSED_ON = 0.11, 0.89, 1.31
 """What a pixel has of itself, and of what is passed on to it: a constant, and weights."""
 
 _SURE, _LIKELY, _UNLIKELY = (math.log(p / (1 - p)) for p in (0.95, 0.75, 0.4))
@@ -68,7 +68,7 @@ _LOCAL, _ROUNDS = (31, 15), 3
 """Columns and rows of the window in which the floor around a pixel is measured, and how often."""
 _NOTHING = 0.02
 """So small a share of a window tells nothing."""
-_LEAST_KNOWN = 0.2
+LEAST_KNOWN = 0.2
 _LEAST_PIXELS = 100
 _NEAR, _WIDE = (5, 5), (9, 9)
 _MOST_SIGMAS, _MOST_NATS = 12.0, 6.0
@@ -172,7 +172,7 @@ def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, floa
 def _mean(values: Picture, known: Picture, size: tuple[int, int]) -> Picture:
     """Return the sum of values around each pixel over how much is known there."""
     share = cv2.blur(known, size)
-    mean: Picture = cv2.blur(values, size) / np.maximum(share, np.float32(_LEAST_KNOWN))
+    mean: Picture = cv2.blur(values, size) / np.maximum(share, np.float32(LEAST_KNOWN))
     return mean
 
 
@@ -206,7 +206,7 @@ def _local_height(seen: Seen, weight: Picture, known: Picture) -> tuple[Picture,
         floor = cv2.blur(on * above, _LOCAL) / (cv2.blur(on, _LOCAL) + np.float32(_NOTHING))
         lowest = -SIGMAS * 1.5
     smooth = _mean(above, known, _NEAR) - floor
-    even = (weight > _LEAST_KNOWN) & (np.abs(smooth) < 3 * SIGMAS)
+    even = (weight > LEAST_KNOWN) & (np.abs(smooth) < 3 * SIGMAS)
     height = (above - floor) / _spread(smooth, even, _UNEVEN)
     bounded = np.clip(height, -_MOST_SIGMAS, _MOST_SIGMAS) * weight
     on_off = np.where(np.abs(height) < SIGMAS, weight, -weight)
@@ -226,7 +226,7 @@ def _rise(seen: Seen, weight: Picture, known: Picture) -> Picture:
     of_floor = seen.floor_px[near] - seen.floor_px[far]
     both = weight[rows:-rows] * known[near] * known[far]
     off = rise - of_floor
-    sigma = _spread(off, (both > _LEAST_KNOWN) & (np.abs(off) < 4 * SAME_PX), _RISE_SIGMA_PX)
+    sigma = _spread(off, (both > LEAST_KNOWN) & (np.abs(off) < 4 * SAME_PX), _RISE_SIGMA_PX)
     ratio = np.zeros_like(known)
     nats = of_floor * (2 * rise - of_floor) / (2 * sigma**2)
     ratio[rows:-rows] = np.clip(nats, -_MOST_NATS, _MOST_NATS) * both
@@ -386,7 +386,7 @@ class Likelihood:
         constant, own, share = self.combined
         around = passed_on(alone, seen.grey, seen.noise_grey)
         together = constant + own * alone + share * around
-        return Likely(alone, together, cv2.blur(weight, _WIDE) > _LEAST_KNOWN)
+        return Likely(alone, together, weight > LEAST_KNOWN)
 
     def alone(self, parts: Picture) -> Picture:
         """Return the log-likelihood ratio of floor of pixels by their features (F, ...) alone."""
