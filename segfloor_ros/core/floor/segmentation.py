@@ -189,7 +189,14 @@ class FloorSegmentation:
         with measure('evidence'):
             left_view = left[columns]
             evidence = _evidence(
-                view, below, left_view, texture, enough, compared, heights, self._settings
+                view,
+                below,
+                left_view,
+                texture,
+                enough,
+                compared,
+                heights,
+                self._settings.step_height_m,
             )
             clear_hidden(evidence.mask, moving, columns)
             below_said = None if said is None else said[columns]
@@ -399,12 +406,12 @@ def _evidence(
     enough: float,
     compared: Comparison,
     heights: Heights,
-    settings: FloorSegmentationSettings,
+    step_m: float,
 ) -> Evidence:
     """Return what the pixels (R, W) of the view say by themselves, cut back to edges, and left
     open where they do not look like floor and are not measured to lie on it.
     """
-    mask = judge(view, below, texture > enough, compared, heights, settings)
+    mask = judge(view, below, texture > enough, compared, heights, step_m)
     seen = trim_to_edges(mask, row_slope(left), TEXTURE_WINDOW_PX // 2 + 3)
     odd, sigmas = unlike_floor(left, seen == FLOOR), mean_height(heights)
     off, standing = np.abs(sigmas) > SIGMAS * MEAN_NOISE, sigmas > SIGMAS

@@ -116,8 +116,9 @@ class Costs:
 class Seen:
     """What is known of each pixel.
 
-    first_row: of the image. floor_px, disparity_px: disparity of the floor, and the matched one, 0 where none is. slope: of
-    a floor's disparity, per row of the image. texture: as many times of what is surely no noise.
+    first_row: of the image. floor_px, disparity_px: disparity of the floor, and the matched one, 0
+    where none is. slope: of a floor's disparity, per row of the image. texture: as many times of
+    what is surely no noise.
     overhead: by how many sigmas it is higher than what a robot climbs. grey: brightness, smoothed.
     costs: None of a depth camera. noise_grey: of the images. is_floor: bool, what is floor so far.
     """
@@ -163,7 +164,9 @@ def _halves(values: Picture) -> tuple[Picture, Picture]:
 
 
 def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, float]) -> np.float32:
-    """Return the standard deviation of some values by their median; the least where they are few."""
+    """Return the standard deviation of some values by their median, within bounds; the least where
+    they are few.
+    """
     some = values[where]
     spread = 1.4826 * float(np.median(np.abs(some))) if len(some) > _LEAST_PIXELS else 0.0
     return np.float32(np.clip(spread, *bounds))

@@ -179,12 +179,13 @@ def judge(
     textured: NDArray[np.bool_],
     compared: Comparison,
     heights: Heights,
-    settings: FloorSegmentationSettings,
+    step_m: float,
 ) -> NDArray[np.uint8]:
     """Return what the pixels (R, W) of the view say by themselves, the mask of `Evidence`.
 
     textured: where a disparity means something; compared: what the images say of the floor. A
-    disparity makes floor only where the images agree, and denies it only where they do.
+    disparity makes floor only where the images agree, and denies it only where they do. step_m:
+    what a robot climbs.
     """
     table, above, off = heights.table, heights.above, heights.off
     # What seems to lie below the floor may be what the floor mirrors.
@@ -200,22 +201,9 @@ def judge(
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
     # On a sill the images contradict the floor, and show that it is a sill; beyond it floor goes on
     # where above a foot there is what stands on it.
-    step_m = np.float32(settings.step_height_m)
-    sill = compared.against & (np.abs(heights.height) <= step_m)
+    sill = compared.against & (np.abs(heights.height) <= np.float32(step_m))
     mask[may_be & sill & below_floor(mask)] = FLOOR
-    mask[
-        (mask == FLOOR) & ~most_around(mask == FLOOR, textured & near & (off | (mask == FLOOR)))
-    ] = NO_EVIDENCE
     return mask
-
-
-def most_around(said: NDArray[np.bool_], measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return around which pixels (R, W) most of what is measured (R, W) says something (R, W): some
-    of what is matched wrongly lies on the floor by chance.
-    """
-    window = (_WIDE_WINDOW, _WIDE_WINDOW)
-    of_all, of_said = (cv2.blur(part.astype(np.float32), window) for part in (measured, said))
-    return np.asarray(of_said >= np.float32(0.5) * of_all)
 
 
 def below_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:

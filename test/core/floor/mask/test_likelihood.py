@@ -1,0 +1,190 @@
+"""What the features of a pixel say, how it is passed on, and what becomes of a mask."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.core.floor.mask.likelihood import (
+    WEIGHTS,
+    Costs,
+    Likelihood,
+    Likely,
+    Seen,
+    features,
+    known_weight,
+    passed_on,
+    weighed,
+)
+
+SHAPE, SLOPE = (120, 200), 0.15
+ROWS, COLUMNS = np.indices(SHAPE, np.float32)
+NOISE_GREY = 1.0
+
+
+def ground(seed: int = 0) -> Seen:
+    """Level ground that is matched everywhere with a noise of half a pixel, of one colour with some
+    texture; two image rows lie between the pixels.
+    """
+    rng = np.random.default_rng(seed)
+    floor_px = 10 + 2 * SLOPE * ROWS
+    matched_px = floor_px + rng.normal(0, 0.5, SHAPE)
+    costs = Costs(*np.full((2, *SHAPE), 1.2, np.float32), np.ones(SHAPE, np.float32))
+    return Seen(
+        first_row=0,
+        floor_px=floor_px,
+        disparity_px=matched_px.astype(np.float32),
+        slope=SLOPE,
+        texture=np.full(SHAPE, 2.0, np.float32),
+        overhead=np.full(SHAPE, -1.0, np.float32),
+        grey=(100 + rng.normal(0, 12, SHAPE)).astype(np.float32),
+        costs=costs,
+        noise_grey=NOISE_GREY,
+        is_floor=np.ones(SHAPE, bool),
+    )
+
+
+def named(seen: Seen) -> dict[str, np.ndarray]:
+    return dict(zip(WEIGHTS, features(seen, known_weight(seen)), strict=True))
+
+
+STONE = np.s_[60:70, 95:105]
+
+
+def test_a_stone_is_higher_than_the_ground_beside_it_wherever_the_profile_lies() -> None:
+    """The profile lies 2 px above the ground: by it the stone is no higher than floor."""
+    seen = ground()
+    stone_px = seen.disparity_px - 2
+    stone_px[STONE] += 2.5
+    parts = named(dataclasses.replace(seen, disparity_px=stone_px))
+    middle = np.s_[63:67, 98:102]
+    assert parts['above'][middle].min() > 2
+    assert parts['off'][middle].mean() > 0.3
+    beside = np.s_[60:70, 120:160]
+    assert parts['above'][beside].mean() < 0.7
+    assert parts['on'][beside].mean() > 0.5
+    likely = Likelihood().of(dataclasses.replace(seen, disparity_px=stone_px))
+    assert likely.alone[middle].max() < 0
+    assert likely.alone[beside].mean() > 2
+
+
+def test_a_hollow_is_lower_and_no_obstacle() -> None:
+    seen = ground()
+    hollow_px = seen.disparity_px.copy()
+    hollow_px[STONE] -= 3
+    parts = named(dataclasses.replace(seen, disparity_px=hollow_px))
+    middle = np.s_[63:67, 98:102]
+    assert parts['below'][middle].min() > 2
+    assert not parts['above'][middle].any()
+
+
+def test_what_is_upright_does_not_rise() -> None:
+    seen = ground()
+    face_px = seen.disparity_px.copy()
+    face_px[30:70, 80:120] = face_px[69, 80:120]
+    parts = named(dataclasses.replace(seen, disparity_px=face_px))
+    assert parts['steep'][45:65, 90:110].mean() > 0.5
+    assert parts['rises'][45:65, 20:60].mean() > 1
+    # Level as a floor, but much higher: that it rises says nothing.
+    table_px = seen.disparity_px.copy()
+    table_px[30:70, 80:120] += 8
+    parts = named(dataclasses.replace(seen, disparity_px=table_px))
+    assert parts['rises'][45:60, 90:110].max() < 0.3
+
+
+def test_what_has_no_texture_or_no_match_says_nothing_of_its_height() -> None:
+    seen = ground()
+    for change in (
+        {'texture': np.full(SHAPE, 0.4, np.float32)},
+        {'disparity_px': np.zeros(SHAPE, np.float32)},
+    ):
+        parts = named(dataclasses.replace(seen, **change))
+        for name in ('above', 'below', 'rises', 'steep', 'on', 'off'):
+            assert not parts[name].any()
+    flat = dataclasses.replace(seen, grey=np.full(SHAPE, 100, np.float32))
+    assert known_weight(flat).max() < 0.1 < known_weight(seen).mean()
+    assert known_weight(dataclasses.replace(flat, costs=None)).min() == 1
+
+
+def test_images_that_differ_on_the_floor_and_not_as_matched_deny_it() -> None:
+    seen = ground()
+    floor = np.full(SHAPE, 1.2, np.float32)
+    floor[:, 100:] = 12.0
+    reached = np.ones(SHAPE, np.float32)
+    reached[60:] = 0
+    costs = Costs(floor, np.full(SHAPE, 1.2, np.float32), reached)
+    parts = named(dataclasses.replace(seen, costs=costs))
+    assert parts['matched'][:60, 100:].min() > 1.5
+    assert parts['cost'][:60, 100:].min() > 5
+    for where in (np.s_[:, :100], np.s_[60:]):
+        assert parts['matched'][where].max() < 0.2
+        assert parts['cost'][where].max() < 0.2
+    measured = named(dataclasses.replace(seen, costs=None))
+    assert not measured['matched'].any() and not measured['cost'].any()
+
+
+def test_what_is_darker_or_brighter_than_the_floor_does_not_look_like_it() -> None:
+    """Light falls off to one side by half: that is no change of the floor."""
+    seen = ground()
+    light = (1 - 0.5 * COLUMNS / SHAPE[1]).astype(np.float32)
+    grey = seen.grey * light
+    grey[STONE] *= 0.4
+    grey[20:30, 95:105] *= 2.0
+    is_floor = np.ones(SHAPE, bool)
+    is_floor[STONE] = is_floor[20:30, 95:105] = False
+    parts = named(dataclasses.replace(seen, grey=grey, is_floor=is_floor))
+    assert parts['dark'][STONE].mean() > 2
+    assert parts['bright'][20:30, 95:105].mean() > 1
+    rest = is_floor & (parts['dark'] + parts['bright'] > 0.5)
+    assert rest.mean() < 0.05
+    assert parts['look'][is_floor].mean() > -0.1 > -1 > parts['look'][STONE].mean()
+    few = named(dataclasses.replace(seen, is_floor=np.zeros(SHAPE, bool)))
+    assert not few['look'].any()
+
+
+def test_what_is_known_is_passed_on_up_to_an_edge_of_the_image() -> None:
+    alone = np.zeros(SHAPE, np.float32)
+    alone[:, :20] = 5
+    grey = np.full(SHAPE, 100, np.float32)
+    grey[:, 60:] = 150
+    around = passed_on(alone, grey, NOISE_GREY)
+    assert around[60, 25:55].min() > 1
+    assert np.all(np.diff(around[60, 25:59]) <= 1e-5)
+    assert around[60, 62:].max() < 0.2 * around[60, 55]
+    # What is certain by itself takes nothing over.
+    assert np.abs(around[:, :20]).max() < 0.1
+
+
+def test_what_stands_says_so_to_what_is_beside_it_too() -> None:
+    alone = np.zeros(SHAPE, np.float32)
+    alone[:, 100:] = -6
+    around = passed_on(alone, np.full(SHAPE, 100, np.float32), NOISE_GREY)
+    assert around[:, 90:99].max() < -1
+
+
+@pytest.mark.parametrize('size', [SHAPE, (240, 200), (240, 400)])
+def test_a_mask_changes_only_where_something_is_measured(size: tuple[int, int]) -> None:
+    """At half the resolution of the mask, or at its own."""
+    mask = np.full(size, NO_EVIDENCE, np.uint8)
+    mask[: size[0] // 2] = FLOOR
+    mask[:, -size[1] // 4 :] = NOT_FLOOR
+    measured = COLUMNS >= 50
+    floor_px = np.full(SHAPE, 10, np.float32)
+    surely = Likely(np.full(SHAPE, 3, np.float32), np.full(SHAPE, 4, np.float32), measured)
+    unlikely = Likely(-surely.alone, -surely.together, measured)
+    left, between = np.s_[:, : size[1] // 4], np.s_[:, size[1] // 4 : -size[1] // 4]
+    changed = weighed(mask, surely, floor_px)
+    np.testing.assert_array_equal(changed[left], mask[left])
+    assert np.all(changed[between] == FLOOR)
+    assert np.all(changed[:, -size[1] // 4 :] == NOT_FLOOR)
+    changed = weighed(mask, unlikely, floor_px)
+    np.testing.assert_array_equal(changed[left], mask[left])
+    assert np.all(changed[between] == NO_EVIDENCE)
+    assert np.all(changed[:, -size[1] // 4 :] == NOT_FLOOR)
+    far = weighed(mask, surely, np.full(SHAPE, 2, np.float32))
+    np.testing.assert_array_equal(far, mask)
+    split = weighed(mask, Likely(unlikely.alone, surely.together, measured), floor_px)
+    np.testing.assert_array_equal(split, mask)
