@@ -40,13 +40,13 @@ STAGES = ('slam', 'floor', 'cloud', 'grid')
 """Data flows from left to right; what passes between them is in `core.contracts`."""
 
 CEILINGS = {
-    'core.pipeline': 9620,
-    'core.slam.stereo_slam': 6305,
+    'core.pipeline': 9695,
+    'core.slam.stereo_slam': 6375,
     'core.floor.segmentation': 2780,
     'core.cloud': 750,
     'core.grid.mapper': 1400,
     'nodes.stereo_camera': 3750,
-    'nodes.stereo_slam': 10150,
+    'nodes.stereo_slam': 10225,
     'nodes.floor_segmentation': 4985,
     'nodes.cloud_labelling': 3050,
     'nodes.occupancy_grid': 3400,

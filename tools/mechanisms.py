@@ -44,6 +44,10 @@ def _none(*_: object, **__: object) -> None:
     return None
 
 
+def _empty(*_: object, **__: object) -> list[Any]:
+    return []
+
+
 def _no_rows(*_: object, **__: object) -> Any:
     return np.zeros(0, np.intp)
 
@@ -114,9 +118,17 @@ SLAM: dict[str, Mechanism] = {
         {'core.slam.mapping.bundle_adjustment._brought_back': lambda *_: np.eye(4)}
     ),
     'places by their floor': Mechanism(
-        {'core.slam.places.loops.PlaceMatcher.look_at_floor': _none}
+        {'core.slam.places.loops.PlaceMatcher.look_at_floor': _empty}
     ),
-    'relocalisation by several frames': Mechanism({'core.slam.places.place_recognition.PROOF': 1}),
+    'places by several views': Mechanism(
+        {'core.slam.places.place_recognition.is_enough': lambda *_: True}
+    ),
+    'what stands around a place': Mechanism(
+        {'core.slam.places.loops.PlaceMatcher.around': lambda *_: np.inf}
+    ),
+    'other places that a view fits': Mechanism(
+        {'core.slam.places.loops.PlaceMatcher.agree': lambda *_: True}
+    ),
     'map parts': Mechanism({'core.slam.session.LOST_NS': 1 << 62}),
     'two motions distinguished': Mechanism({'core.slam.tracking.pose.differ': lambda a, b: False}),
     'motion so far': Mechanism({'core.slam.tracking.front_end.FrontEnd._standing': _found}),

@@ -50,7 +50,7 @@ from segfloor_ros.core.plugins.maps.saved_slam import (
     straightened,
 )
 from segfloor_ros.core.plugins.semantics.label_map import LABELS, LabelMap, Labels
-from segfloor_ros.core.slam.places.loops import MAX_SLOPE, MAX_STEP_UP_M
+from segfloor_ros.core.slam.places.loops import SLOPE_SIGMA, UP_SIGMA_M
 from segfloor_ros.core.slam.rig import Rig
 from segfloor_ros.nodes.map_files import check_map_output, save_map
 
@@ -327,7 +327,7 @@ def merge(first: SavedMap, second: SavedMap) -> SavedMap:
 def _check_mounts(first: SavedMap, second: SavedMap) -> None:
     mount, other = mount_of(first.file), mount_of(second.file)
     turned = max(abs(mount.pitch_rad - other.pitch_rad), abs(mount.roll_rad - other.roll_rad))
-    if abs(mount.height_m - other.height_m) > MAX_STEP_UP_M or turned > MAX_SLOPE:
+    if abs(mount.height_m - other.height_m) > 4 * UP_SIGMA_M or turned > 4 * SLOPE_SIGMA:
         raise InputError(
             f'{second.name}: the camera is not mounted as in {first.name} (it is '
             f'{other.height_m:.2f} m above the floor, not {mount.height_m:.2f} m); keep both maps'

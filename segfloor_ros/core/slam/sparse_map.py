@@ -9,6 +9,7 @@ In: keyframes and points of mapping. Out: arrays by row or by id, for tracking, 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -266,7 +267,8 @@ class LoopEdge:
 class Match:
     """A keyframe that sees a place of the map again. place: the keyframe that knows it best, both
     by index. T_camera_world: (4, 4) the keyframe's camera as seen from there. rows, ids: (N,)
-    features and the place's points they show, stable_ids: (N,) of these.
+    features and the place's points they show, stable_ids: (N,) of these. log_ratio: of what it
+    shows over chance, in nats.
     """
 
     keyframe: int
@@ -275,6 +277,7 @@ class Match:
     rows: NDArray[np.intp]
     ids: NDArray[np.int32]
     stable_ids: NDArray[np.int32]
+    log_ratio: float = math.inf
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 ENOUGH = 20
-"""Fewest points that must agree for a pose, or for two views of one place, to be believed; half as
-many for a first guess. Chance gives five or six."""
+"""Fewest points that must be shared for two views to be linked. Chance gives five or six."""
 
 SAME = 0.5, 0.3
 """Two poses further apart than this, in m and rad, are two places."""
@@ -17,7 +16,7 @@ CHANCE_SHARE = 0.1
 places."""
 
 MOST = 0.6
-"""Share of what is expected at a pose that must be found there: what looks alike shows less."""
+"""Share of what was followed that must be left of it."""
 
 NEARLY_ALL = 0.9
 """Share of a keyframe's points that others must see as well, or of a view that they must cover, for
@@ -30,7 +29,7 @@ others see, and corners of its floor; the rest moves along."""
 
 PROOF = 3
 """Keyframes that must show something for it to be believed: that a point stands still, or is gone,
-that a view adds nothing, that a place is seen again; and corners of a thing that moves. By chance
+that a view adds nothing; and corners of a thing that moves. By chance
 hardly two agree."""
 
 

@@ -299,7 +299,7 @@ def test_one_frame_finds_a_camera_that_is_where_it_was_lost(mapped, monkeypatch)
 
 
 def test_who_is_lost_must_see_what_is_expected_all_over_the_image(mapped, monkeypatch):
-    monkeypatch.setattr('segfloor_ros.core.slam.places.place_recognition.MOST', 1.01)
+    monkeypatch.setattr('segfloor_ros.core.slam.places.place_recognition.CHANCE_SHARE', 1.0)
     slam = loaded(mapped, localize=True)
     results = [slam.process(ROOM.frame(k, there(25)[10]))[0] for k in range(5)]
     assert not any(result.tracked for result in results)

@@ -9,6 +9,7 @@ second are looked for in the first by what they observed, one after the other.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -36,17 +37,11 @@ from segfloor_ros.core.slam.places.place_recognition import (
     Relocaliser,
     Vocabulary,
 )
-from segfloor_ros.core.slam.rig import OffsetEstimate, Rig
+from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, OffsetEstimate, Rig
 from segfloor_ros.core.slam.sparse_map import GroundView, KeyframeRecord, Match, SparseMap
-from segfloor_ros.core.slam.thresholds import PROOF
 from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.map_tracking import Pixels
 from segfloor_ros.core.slam.tracking.track import Track
-
-TIMES_SURE = 2
-"""Where nothing limits where a place can be, so many times the evidence of a loop is asked for:
-walls with the same paper, and shelves that stand twice in a building, are taken for one now and
-then."""
 
 OFFSET = 'disparity_offset'
 """What a map knows of the disparity offset, by name."""
@@ -63,7 +58,7 @@ class KnownMap:
         self._places = PlaceRecognition(self._map)
         self._places.from_arrays(arrays)
         self._relocaliser = Relocaliser(self._map, self._places)
-        self._matcher = PlaceMatcher(own, self._map, self._places, TIMES_SURE * PROOF)
+        self._matcher = PlaceMatcher(own, self._map, self._places)
         self._floors = FloorIndex(self._map.keyframes)
 
     @property
@@ -72,23 +67,23 @@ class KnownMap:
         return len(self._map.keyframes)
 
     def recognise(self, keyframe: KeyframeRecord, images: Pixels) -> bool:
-        """Whether enough keyframes in a row see the known map, this one the last of them. One whose
-        floor is seen elsewhere than its look says nothing: shelves and pictures are all over a
-        building, and so are floors.
+        """Whether enough keyframes in a row see the known map, this one the last of them. Look and
+        floor compete where they differ: shelves and pictures are all over a building, and so are
+        floors.
         """
         anywhere = np.ones(len(self._map.keyframes), bool)
+        alike = self._floors.like(keyframe.ground)[:LOCAL_KEYFRAMES]
+        found = self._matcher.look_at_floor(keyframe, alike)
         by_look = self._matcher.look(keyframe, images, anywhere, ~anywhere)
-        by_floor = self._matcher.look_at_floor(keyframe, self._floors.like(keyframe.ground))
-        match = by_look or by_floor
-        is_possible = match is not None and self._is_possible(keyframe, match)
-        if by_look and by_floor and not self._matcher.agree(by_look, by_floor):
-            is_possible = False
-        return self._matcher.add(match if is_possible else None)
+        found += [by_look] if by_look else []
+        seen = self._matcher.best(keyframe, found, self._travel)
+        return self._matcher.add(None if seen is None or seen[1].objection else seen)
 
-    def _is_possible(self, keyframe: KeyframeRecord, match: Match) -> bool:
+    def _travel(self, match: Match) -> float:
+        """Return how likely the robot is at a match: at any place that it can have come to."""
         if self.of_drive and not self._matcher.is_within_reach(match):
-            return False
-        return not self._matcher.objection(keyframe, match)
+            return -math.inf
+        return -math.log(self.num_keyframes)
 
     def find(
         self, images: Pixels, features: Features, stamp_ns: int

@@ -1,14 +1,15 @@
 """Places that keyframes see again: of their own map after the path has drifted, a loop, or of a
 known one.
 
-Precision comes first: a loop that is missed costs drift, a false one costs the map. The place must
-lie where drift can have put it, several keyframes must see it, each on its own, and they must agree
-on drift and floor, and see the same space from both sides.
+Precision comes first: a loop that is missed costs drift, a false one costs the map. What several
+keyframes say for one place, by points or by the floor, by what they see through it and by how the
+robot can have come there, is weighed as one sum (see `evidence`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +19,8 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from segfloor_ros.core.contracts import NO_POINT, Mount
-from segfloor_ros.core.geometry import Array, invert, transform_points
+from segfloor_ros.core.geometry import Array, invert, rotation_angle, transform_points
+from segfloor_ros.core.slam.places.evidence import HOPELESS, PlaceEvidence, of_counts, of_errors
 from segfloor_ros.core.slam.places.place_recognition import (
     PlaceRecognition,
     Sightings,
@@ -31,15 +33,7 @@ from segfloor_ros.core.slam.places.views import (
     seen_ahead_m,
     views_near,
 )
-from segfloor_ros.core.slam.rig import (
-    GATE,
-    LOCAL_KEYFRAMES,
-    MIN_DEPTH_M,
-    NEIGHBOURS,
-    SAME_PX,
-    chi2_limit,
-    in_view,
-)
+from segfloor_ros.core.slam.rig import GATE, MIN_DEPTH_M, NEIGHBOURS, SAME_PX, chi2_limit, in_view
 from segfloor_ros.core.slam.sparse_map import (
     LINK_SIGMA,
     LOOP_FACTOR,
@@ -49,17 +43,20 @@ from segfloor_ros.core.slam.sparse_map import (
     features_of,
     loop_sigma,
 )
-from segfloor_ros.core.slam.thresholds import ENOUGH, MOST, PROOF, SAME
+from segfloor_ros.core.slam.thresholds import ENOUGH, PROOF, SAME
 from segfloor_ros.core.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels
 from segfloor_ros.core.twists import is_within
 
-DRIFT_PER_M = 0.04, 0.01
-"""Drift of a path in m and rad per m: stereo odometry drifts by one per cent or less."""
+DRIFT_PER_M = 0.01, 0.0025
+"""Error of a path, m and rad per m: stereo odometry drifts by one per cent or less."""
 
-FREE_DRIFT = 0.3, 0.1
-"""Drift, in m and rad, of the shortest of ways."""
+FREE_DRIFT = 0.07, 0.023
+"""Error, m and rad, of the shortest of ways."""
 
-MAX_STEP_UP_M, MAX_SLOPE = 0.1, 0.2
+REACH_SIGMAS = float(np.sqrt(-2 * HOPELESS))
+"""Farther than so many sigmas no place is believed."""
+
+UP_SIGMA_M, SLOPE_SIGMA = 0.025, 0.05
 """Where a robot stands on the same floor again, its camera is about as high and, in rad, as level
 as before: floors slope, and carts shake."""
 
@@ -88,7 +85,7 @@ class LoopDetector:
         self.candidates: list[Candidate] = []
         self._map = sparse_map
         self._places = places
-        self._matcher = PlaceMatcher(sparse_map, sparse_map, places, PROOF)
+        self._matcher = PlaceMatcher(sparse_map, sparse_map, places)
 
     def reset(self) -> None:
         """Believe in no loop."""
@@ -96,20 +93,21 @@ class LoopDetector:
 
     def detect(self, keyframe: KeyframeRecord, images: Pixels) -> list[Match]:
         """Return the keyframes that see a place again, once there are enough of them, else none."""
-        lengths = path_lengths(self._map, keyframe.index)
-        near = self._linked(keyframe)
-        (free_m, free_rad), (per_m, rad_per_m) = FREE_DRIFT, DRIFT_PER_M
-        reach_m, reach_rad = free_m + per_m * lengths, free_rad + rad_per_m * lengths
+        lengths_m, near = path_lengths(self._map, keyframe.index), self._linked(keyframe)
+        reach_m, reach_rad = (REACH_SIGMAS * sigma for sigma in drift_sigma(lengths_m))
         shown = self._places.shown_from(keyframe.T_world_camera, reach_m, reach_rad)
-        match = self._matcher.look(keyframe, images, ~near & shown, near)
-        match = match or self._from_above(keyframe, ~near, reach_m)
-        if match is not None:
-            reach = float(reach_m[match.place]), float(reach_rad[match.place])
-            objection = objection_to_drift(keyframe, match, reach)
-            objection = objection or self._matcher.objection(keyframe, match)
-            self._note(match, objection or 'seen')
-            match = None if objection else match
-        if not self._matcher.add(match):
+        by_look = self._matcher.look(keyframe, images, ~near & shown, near)
+        found = [by_look] if by_look else self._from_above(keyframe, ~near, reach_m)
+
+        def travel(match: Match) -> float:
+            return likely_drift(keyframe, match, float(lengths_m[match.place]))
+
+        seen = self._matcher.best(keyframe, found, travel)
+        if seen is not None:
+            objection = 'no drift' if is_no_drift(keyframe, seen[0]) else seen[1].objection
+            self._note(seen[0], objection or 'seen')
+            seen = None if objection else seen
+        if not self._matcher.add(seen):
             return []
         matches = self._matcher.matches
         self.reset()
@@ -130,23 +128,23 @@ class LoopDetector:
 
     def _from_above(
         self, keyframe: KeyframeRecord, others: NDArray[np.bool_], reach_m: Array
-    ) -> Match | None:
+    ) -> list[Match]:
         """Look for the floor of other keyframes (K,), within reach (K,), that look another way."""
         mount, keyframes = self._map.rig.mount, self._map.keyframes
         if mount is None or not len(keyframe.ground.xy_m):
-            return None
+            return []
         middle = invert(mount.T_base_left) @ np.array([seen_ahead_m(mount), 0.0, 0.0, 1.0])
         poses = invert(np.stack([k.T_camera_world for k in keyframes]))
         distance = np.linalg.norm((poses - keyframe.T_world_camera) @ middle, axis=1)
         turned = poses[:, :3, 2] @ keyframe.T_world_camera[:3, 2] <= MIN_VIEW_COSINE
         shown = np.array([len(k.ground.xy_m) > 0 for k in keyframes])
         near = np.flatnonzero(others & turned & shown & (distance < reach_m + seen_ahead_m(mount)))
-        return self._matcher.look_at_floor(keyframe, near[np.argsort(distance[near])])
+        return self._matcher.look_at_floor(keyframe, near[np.argsort(distance[near])[:PROOF]])
 
 
 def path_lengths(sparse_map: SparseMap, index: int) -> Array:
     """Return the length (K,) in metres of the shortest way from a keyframe to each other one, over
-    keyframes that share points: what drift builds up along.
+    keyframes that share points: what drift builds up along. To where none leads it is the longest.
     """
     i, j = sparse_map.links()
     i = np.append(i, [loop.i for loop in sparse_map.loops]).astype(np.int32)
@@ -155,33 +153,41 @@ def path_lengths(sparse_map: SparseMap, index: int) -> Array:
     centres = invert(poses)[:, :3, 3]
     weight = np.linalg.norm(centres[i] - centres[j], axis=1) + 1e-6
     graph = sparse.csr_matrix((weight, (i, j)), shape=(len(centres), len(centres)))
-    return np.asarray(dijkstra(graph, directed=False, indices=[index]))[0]
+    lengths = np.asarray(dijkstra(graph, directed=False, indices=[index]))[0]
+    return np.minimum(lengths, lengths[np.isfinite(lengths)].max())
 
 
-def objection_to_drift(keyframe: KeyframeRecord, match: Match, reach: tuple[float, float]) -> str:
-    """Return what speaks against a match in the same map: the path cannot have drifted so far, in m
-    and rad, or has not drifted; '' for nothing.
-    """
+def drift_sigma(length_m: Array) -> tuple[Array, Array]:
+    """Return by how much paths (K,) of a length err, in m and rad."""
+    (free_m, free_rad), (per_m, rad_per_m) = FREE_DRIFT, DRIFT_PER_M
+    return free_m + per_m * length_m, free_rad + rad_per_m * length_m
+
+
+def likely_drift(keyframe: KeyframeRecord, match: Match, length_m: float) -> float:
+    """Return how likely it is that a path of a length has drifted as a match shows, in nats."""
+    T = match.T_camera_world @ keyframe.T_world_camera
+    sigma_m, sigma_rad = map(float, drift_sigma(np.array(length_m)))
+    moved_m, turned_rad = float(np.linalg.norm(T[:3, 3])), float(rotation_angle(T[:3, :3]))
+    return of_errors((moved_m, sigma_m), (turned_rad, sigma_rad))
+
+
+def is_no_drift(keyframe: KeyframeRecord, match: Match) -> bool:
+    """Whether a match in the same map is where the path has it already."""
     moved = match.T_camera_world @ keyframe.T_world_camera
-    if is_within(moved, loop_sigma(by_floor=not len(match.rows))):
-        return 'no drift'
-    return '' if is_within(moved, reach) else 'more than drift'
+    return bool(is_within(moved, loop_sigma(by_floor=not len(match.rows))))
 
 
 class PlaceMatcher:
     """Matches keyframes with the places of a known map, which may be their own, until enough of
-    them agree. needed: how many that are.
+    them agree.
     """
 
-    def __init__(
-        self, own: SparseMap, known: SparseMap, places: PlaceRecognition, needed: int
-    ) -> None:
+    def __init__(self, own: SparseMap, known: SparseMap, places: PlaceRecognition) -> None:
         self._map = own
         self._camera = own.rig.camera
         self._known = known
         self._places = places
-        self._needed = needed
-        self._sightings: Sightings[Match] = Sightings(needed, self.agree)
+        self._sightings: Sightings[Match] = Sightings(self.agree, self._newness)
 
     def reset(self) -> None:
         """Believe in no place."""
@@ -220,43 +226,63 @@ class PlaceMatcher:
         ids = track.observed.point_id[rows]
         order, _ = self._known.covisible(ids)
         place = int(order[may_show[order]][0])
-        stable_ids = self._known.stable_id[ids]
-        return Match(keyframe.index, place, track.T_camera_world, rows, ids, stable_ids)
+        stable_ids, log_ratio = self._known.stable_id[ids], self._places.log_ratio(track)
+        return Match(keyframe.index, place, track.T_camera_world, rows, ids, stable_ids, log_ratio)
 
-    def look_at_floor(self, keyframe: KeyframeRecord, places: NDArray[np.intp]) -> Match | None:
-        """Look for the floor of the first of known keyframes (N,), by index, from whatever side;
-        None where they do not agree. Floors repeat themselves: where no drift limits where the
-        place is, more of them are tried, and those count where what stands around the keyframe
-        stands, too.
-        """
+    def look_at_floor(self, keyframe: KeyframeRecord, places: NDArray[np.intp]) -> list[Match]:
+        """Return where known keyframes (N,), by index, show the same floor, from whatever side."""
         mount, found = self._map.rig.mount, list[Match]()
         if mount is None:
-            return None
-        is_bounded = self._known is self._map
+            return found
         nothing = np.zeros(0, np.intp), np.zeros(0, np.int32), np.zeros(0, np.int32)
-        for place in places[: PROOF if is_bounded else LOCAL_KEYFRAMES].tolist():
+        for place in places.tolist():
             known = self._known.keyframes[place]
-            T_base_place = motion_between(keyframe.ground, known.ground, mount.height_m)
-            if T_base_place is None:
-                continue
-            T_camera_place = invert(mount.T_base_left) @ T_base_place @ mount.T_base_left
-            pose = T_camera_place @ known.T_camera_world
-            match = Match(keyframe.index, place, pose, *nothing)
-            if is_bounded or self.stands_alike(match):
-                found.append(match)
-        agree = found and all(self.agree(match, found[0]) for match in found[1:])
-        return found[0] if agree else None
+            motion = motion_between(keyframe.ground, known.ground, mount.height_m)
+            if motion is not None:
+                T_camera_place = invert(mount.T_base_left) @ motion[0] @ mount.T_base_left
+                pose = T_camera_place @ known.T_camera_world
+                found.append(Match(keyframe.index, place, pose, *nothing, motion[1]))
+        return found
 
-    def add(self, match: Match | None) -> bool:
-        """Take in what the next keyframe sees of the place; returns whether enough of them agree,
-        two of them so far apart that each of so many views on the way is new.
+    def best(
+        self, keyframe: KeyframeRecord, found: list[Match], travel: Callable[[Match], float]
+    ) -> tuple[Match, PlaceEvidence] | None:
+        """Return what fits a keyframe best; what disagrees with it counts against it. travel: how
+        likely the robot is at a match before that is seen, in nats.
         """
-        if not self._sightings.add(match):
-            return False
-        depth_m = median_depth_m(self._map, self._map.keyframes[self.matches[-1].keyframe])
-        poses = np.stack([match.T_camera_world for match in self.matches])
-        novelties = novelty(poses[:, None] @ invert(poses), depth_m)
-        return bool(novelties.max() >= self._needed - 1)
+        said = [(match, self.evidence(keyframe, match, travel(match))) for match in found]
+        if not said:
+            return None
+        best, evidence = max(said, key=lambda one: one[1].seen + one[1].prior)
+        others = [other.seen for match, other in said if not self.agree(match, best)]
+        return best, replace(evidence, rivals=-max(0.0, *others, 0.0))
+
+    def evidence(self, keyframe: KeyframeRecord, match: Match, travel: float) -> PlaceEvidence:
+        """Return what a keyframe says for a match. A floor alone could be anywhere in a map: there
+        it counts no more than what stands around.
+        """
+        around = np.inf if self._known is self._map else self.around(match)
+        by_points = len(match.rows) > 0
+        return PlaceEvidence(
+            look=match.log_ratio if by_points else 0.0,
+            ground=0.0 if by_points else min(match.log_ratio, around),
+            around=around if np.isfinite(around) else 0.0,
+            sides=self._sides(keyframe, match) if by_points else 0.0,
+            free=self._free(keyframe, match),
+            travel=travel,
+            level=self.level(match),
+        )
+
+    def add(self, seen: tuple[Match, PlaceEvidence] | None) -> bool:
+        """Take in what the next keyframe sees of the place; returns whether that is enough."""
+        return self._sightings.add(seen)
+
+    def _newness(self, matches: list[Match]) -> list[float]:
+        """Return how new the view of each keyframe is to those before it."""
+        depth_m = median_depth_m(self._map, self._map.keyframes[matches[-1].keyframe])
+        poses = np.stack([match.T_camera_world for match in matches])
+        new = novelty(poses[:, None] @ invert(poses), depth_m)
+        return [float(new[k, :k].min(initial=1.0)) for k in range(len(matches))]
 
     def agree(self, before: Match, latest: Match) -> bool:
         """Whether two keyframes show the same drift, up to what two loops err."""
@@ -275,35 +301,26 @@ class PlaceMatcher:
         lost_s = 1e-9 * (first.stamp_ns - known[-1].stamp_ns)
         return bool(np.linalg.norm(way[:3, 3]) <= SAME[0] + greatest_speed_mps(known) * lost_s)
 
-    def objection(self, keyframe: KeyframeRecord, match: Match) -> str:
-        """Return what else speaks against a match, '' for nothing."""
-        if not self.is_level(match):
-            return 'another floor'
-        if len(match.rows) and not self._holds_back(keyframe, match):
-            return 'not seen from the other side'
-        if self._seen_through(keyframe, match) > MAX_SEEN_THROUGH:
-            return 'free space through obstacles'
-        return ''
-
-    def is_level(self, match: Match) -> bool:
-        """Whether the robot stands on the floor of the place, as far as the mount is known."""
+    def level(self, match: Match) -> float:
+        """Return how likely it is that the robot stands as high and as level as at the place."""
         mount = self._map.rig.mount
         if mount is None:
-            return True
+            return 0.0
         place = self._known.keyframes[match.place]
         T_base_left = mount.T_base_left
         T_place_now = place.T_camera_world @ invert(match.T_camera_world)
         T = T_base_left @ T_place_now @ invert(T_base_left)
-        up_m = abs(T[2, 3]) - MAX_SLOPE * float(np.linalg.norm(T[:2, 3]))
+        up_sigma_m = UP_SIGMA_M + SLOPE_SIGMA * float(np.linalg.norm(T[:2, 3]))
         tilt = float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
-        return bool(up_m <= MAX_STEP_UP_M and tilt <= MAX_SLOPE)
+        return of_errors((T[2, 3], up_sigma_m), (tilt, SLOPE_SIGMA))
 
-    def stands_alike(self, match: Match) -> bool:
-        """Whether what stands around the keyframe stands where the known map has it, and not as
-        well in a place beside: floors repeat themselves.
+    def around(self, match: Match) -> float:
+        """Return how much likelier what stands around the keyframe stands where the known map has
+        it than in a place beside: floors repeat themselves.
         """
         mount = self._map.rig.mount
-        assert mount is not None
+        if mount is None:
+            return 0.0
         recent = np.arange(max(0, match.keyframe - NEIGHBOURS), match.keyframe + 1)
         own = upright(self._map, mount, self._map.points_of(recent))
         own = transform_points(invert(drift(self._map, match)), own)
@@ -314,7 +331,7 @@ class PlaceMatcher:
         shifts = np.concatenate([np.zeros((1, 3)), 4 * ring, 8 * ring, 12 * ring])
         gaps_m, _ = self._upright.query(own[:, None] + shifts, distance_upper_bound=reach_m)
         here, *beside = np.isfinite(gaps_m).sum(axis=0)
-        return bool(here >= ENOUGH and here - np.sqrt(here) > max(beside) + np.sqrt(max(beside)))
+        return of_counts(here, max(beside))
 
     @cached_property
     def _upright(self) -> cKDTree:
@@ -323,27 +340,25 @@ class PlaceMatcher:
         alive = np.flatnonzero(self._known.alive)
         return cKDTree(upright(self._known, self._map.rig.mount, alive))
 
-    def _holds_back(self, keyframe: KeyframeRecord, match: Match) -> bool:
-        """Whether the keyframe's own points lie where the place's keyframe sees what they match."""
+    def _sides(self, keyframe: KeyframeRecord, match: Match) -> float:
+        """Return how much likelier than not the keyframe's own points lie where the place's
+        keyframe sees what they match.
+        """
         own = keyframe.point_id[match.rows]
-        point, holder, row = self._known.edges_of(match.ids)
-        of_place = holder == match.place
-        slot = np.searchsorted(np.sort(match.ids), point[of_place])
-        slot = np.argsort(match.ids)[slot]
-        measured = own[slot] != NO_POINT
-        slot, row = slot[measured], row[of_place][measured]
-        if len(slot) < ENOUGH:
-            return False
         place = self._known.keyframes[match.place]
+        _, row, slot = np.intersect1d(place.point_id, match.ids, return_indices=True)
+        measured = own[slot] != NO_POINT
+        slot, row = slot[measured], row[measured]
         T_place_world = place.T_camera_world @ invert(match.T_camera_world)
         local = transform_points(keyframe.T_camera_world, self._map.xyz_world[own[slot]])
         uvd, _ = in_view(self._camera, transform_points(T_place_world, local))
         gap = np.linalg.norm(uvd[:, :2] - place.observations.uvd_px[row, :2], axis=1)
-        return float((gap < SAME_PX).mean()) >= MOST
+        agree = int((gap < SAME_PX).sum())
+        return of_counts(agree, len(gap) - agree)
 
-    def _seen_through(self, keyframe: KeyframeRecord, match: Match) -> float:
-        """Return the larger share of the points of one side that the other sees through, were both
-        the same place: the rays to what is seen are free.
+    def _free(self, keyframe: KeyframeRecord, match: Match) -> float:
+        """Return how likely it is, were both the same place, that one side sees through so many
+        points of the other: the rays to what is seen are free.
         """
         place = self._known.keyframes[match.place]
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
@@ -353,14 +368,14 @@ class PlaceMatcher:
         in_now = transform_points(keyframe.T_camera_world, self._map.xyz_world[own])
         in_place = transform_points(place.T_camera_world, self._known.xyz_world[known])
         T_place_now = place.T_camera_world @ invert(match.T_camera_world)
-        return max(
-            self._share_in_front(transform_points(T_place_now, in_now), in_place),
-            self._share_in_front(transform_points(invert(T_place_now), in_place), in_now),
+        return min(
+            self._not_in_front(transform_points(T_place_now, in_now), in_place),
+            self._not_in_front(transform_points(invert(T_place_now), in_place), in_now),
         )
 
-    def _share_in_front(self, points: Array, seen: Array) -> float:
-        """Return the share of points (N, 3) that lie in front of what a camera sees (M, 3) beside
-        them, both in its optical frame; 0 where few can be compared.
+    def _not_in_front(self, points: Array, seen: Array) -> float:
+        """Return how likely it is that so few points (N, 3) lie behind what a camera sees (M, 3)
+        beside them, both in its optical frame; 0 where none can be compared.
         """
         uvd, valid = in_view(self._camera, points)
         uvd_seen, _ = in_view(self._camera, seen)
@@ -369,11 +384,10 @@ class PlaceMatcher:
             return 0.0
         gap, near = cKDTree(uvd_seen[:, :2]).query(uvd[:, :2], distance_upper_bound=SAME_PX)
         beside = np.isfinite(gap)
-        if beside.sum() < ENOUGH:
-            return 0.0
         behind = uvd_seen[np.asarray(near)[beside], 2]
         margin = np.maximum(SAME_PX, IN_FRONT_SHARE * behind)
-        return float((uvd[beside, 2] - behind > margin).mean())
+        in_front = int((uvd[beside, 2] - behind > margin).sum())
+        return of_counts(MAX_SEEN_THROUGH * beside.sum(), in_front)
 
 
 def drift(sparse_map: SparseMap, match: Match) -> Array:
@@ -383,9 +397,9 @@ def drift(sparse_map: SparseMap, match: Match) -> Array:
 
 
 def upright(sparse_map: SparseMap, mount: Mount, ids: NDArray[np.integer]) -> Array:
-    """Return those of points (N,), (M, 3), that stand higher than a step above the floor."""
+    """Return those of points (N,), (M, 3), that stand clearly above the floor."""
     xyz = sparse_map.xyz_world[ids]
-    return xyz[transform_points(mount.T_base_left, xyz)[:, 2] > MAX_STEP_UP_M]
+    return xyz[transform_points(mount.T_base_left, xyz)[:, 2] > 4 * UP_SIGMA_M]
 
 
 def median_depth_m(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:

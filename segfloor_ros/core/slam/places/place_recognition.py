@@ -30,10 +30,12 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.core.files.arrays import Arrays, joined, split
 from segfloor_ros.core.geometry import Array, invert, transform_points
+from segfloor_ros.core.slam.places.evidence import OF_VIEW, PlaceEvidence, is_enough, of_counts
 from segfloor_ros.core.slam.places.views import COLUMNS, ROWS
 from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap, features_of
-from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, ENOUGH, MOST, PROOF, SAME
+from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, SAME
+from segfloor_ros.core.slam.tracking.evidence import ENOUGH_EVIDENCE
 from segfloor_ros.core.slam.tracking.images import Features, hamming
 from segfloor_ros.core.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels, Tracker
 from segfloor_ros.core.slam.tracking.track import Track
@@ -194,22 +196,19 @@ class PlaceRecognition:
         unless it sees them.
         """
         track = self._tracker.track_at(images, features, ids, T_camera_world)
-        return track if track is not None and self.is_same_place(track) else None
+        return track if track is not None and self.log_ratio(track) > 0 else None
 
-    def is_same_place(self, track: Track) -> bool:
-        """Whether a frame shows enough of what it should, and in most parts of the image more of it
-        than by chance.
+    def log_ratio(self, track: Track) -> float:
+        """Return how much likelier than by chance what a frame shows of what it should is, in nats,
+        where two parts of the image count as much as a view: each is one thing.
         """
-        found, expected = len(track.point_ids), len(track.visible_ids)
-        if found < ENOUGH or found < CHANCE_SHARE * expected:
-            return False
         seen, there = (
             self._per_cell(self._map.xyz_world[ids], track.T_camera_world)
             for ids in (track.point_ids, track.visible_ids)
         )
-        full = there >= ENOUGH // 2
-        agree = seen - np.sqrt(seen) >= 0.5 * CHANCE_SHARE * there
-        return bool(full.any() and agree[full].mean() >= MOST)
+        full = np.flatnonzero(there)
+        parts = [of_counts(seen[k], CHANCE_SHARE * there[k]) for k in full]
+        return float(np.clip(parts, -0.5 * OF_VIEW, 0.5 * OF_VIEW).sum())
 
     def _per_cell(self, xyz_world: Array, T_camera_world: Array) -> NDArray[np.intp]:
         """Return how many of points (N, 3) lie in each part (COLUMNS * ROWS,) of the image."""
@@ -245,11 +244,6 @@ class PlaceIndex:
     def words_of(self, keyframe: int) -> NDArray[np.int32]:
         """Return the words (N,) of a keyframe, ascending."""
         return self._words.get(keyframe, np.zeros(0, np.int32))
-
-    def remove(self, keyframe: int) -> None:
-        """Forget a keyframe."""
-        for word in self._words.pop(keyframe, np.zeros(0, np.int32)).tolist():
-            self._keyframes[word].remove(keyframe)
 
     def score(self, words: NDArray[np.int32], count: int) -> Array:
         """Return how much of a view with words (N,) each keyframe (count,) holds, in [0, 1]: words
@@ -305,29 +299,37 @@ View = TypeVar('View')
 
 
 class Sightings(Generic[View]):
-    """Views that see a place and agree with the latest of them where that is. `needed` of them are
-    proof; a view that does not see the place takes the oldest away. agree: of an earlier view and
-    the latest.
+    """Views that see a place and agree with the latest of them where that is. One that sees none
+    takes the oldest away. agree: of an earlier view and the latest. newness: of each view (N,) to
+    those before, 1 where it is all new.
     """
 
-    def __init__(self, needed: int, agree: Callable[[View, View], bool]) -> None:
-        self._needed = needed
-        self._agree = agree
+    def __init__(
+        self,
+        agree: Callable[[View, View], bool],
+        newness: Callable[[list[View]], list[float]] = lambda views: [1.0] * len(views),
+    ) -> None:
+        self._agree, self._newness = agree, newness
         self.reset()
 
     def reset(self) -> None:
         """Know of no view."""
-        self.views: list[View] = []
+        self._seen: list[tuple[View, PlaceEvidence]] = []
 
-    def add(self, view: View | None) -> bool:
-        """Take in the next view, None for one that does not see the place; returns whether it is
-        proven.
+    @property
+    def views(self) -> list[View]:
+        """The views, the latest last."""
+        return [view for view, _ in self._seen]
+
+    def add(self, seen: tuple[View, PlaceEvidence] | None) -> bool:
+        """Take in the next view and what it says, None for one that does not see the place; returns
+        whether it is proven.
         """
-        if view is None:
-            self.views = self.views[1:]
+        if seen is None:
+            self._seen = self._seen[1:]
             return False
-        self.views = [*(before for before in self.views if self._agree(before, view)), view]
-        return len(self.views) >= self._needed
+        self._seen = [*(before for before in self._seen if self._agree(before[0], seen[0])), seen]
+        return is_enough([evidence for _, evidence in self._seen], self._newness(self.views))
 
 
 class Relocaliser:
@@ -336,7 +338,7 @@ class Relocaliser:
     def __init__(self, sparse_map: SparseMap, places: PlaceRecognition) -> None:
         self._map = sparse_map
         self._places = places
-        self._sightings = Sightings(PROOF, self._can_have_moved)
+        self._sightings = Sightings(self._can_have_moved)
         self.reset()
 
     def reset(self) -> None:
@@ -381,9 +383,11 @@ class Relocaliser:
             self._sightings.add(None)
             return None
         pose = found.T_camera_world
-        is_proven = self._sightings.add((stamp_ns, found))
         is_expected = lost_at is not None and is_within(pose @ invert(lost_at), SAME)
-        if not (is_proven or is_expected or given is not None):
+        # Where it is expected, no other place can be meant.
+        travel = ENOUGH_EVIDENCE if is_expected or given is not None else 0.0
+        evidence = PlaceEvidence(look=self._places.log_ratio(found), travel=travel)
+        if not self._sightings.add(((stamp_ns, found), evidence)):
             return None
         views = self._sightings.views
         self.reset()

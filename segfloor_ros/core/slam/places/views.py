@@ -11,7 +11,8 @@ B, enough points for a pose, holds for every frame that is tracked.
 A corridor driven back shows other sides of things, but the same floor. The image is projected onto
 the floor (inverse perspective mapping: Mallot et al., Biol. Cybern. 1991), with corners described
 where it is sharp; two views of the same floor differ by a motion in the plane, found by RANSAC.
-Floor that looks the same in many places, such as tiles, gives several motions: then none is known.
+Floor that looks the same in many places, such as tiles, gives several motions: the best counts as
+far as it is better than the next.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from segfloor_ros.core.geometry import (
     rotation_angle,
     transform_points,
 )
+from segfloor_ros.core.slam.places.evidence import of_counts
 from segfloor_ros.core.slam.rig import FITTING, NEIGHBOURS, SAME_PX, Rig, in_view
 from segfloor_ros.core.slam.sparse_map import (
     NOTHING,
@@ -42,7 +44,6 @@ from segfloor_ros.core.slam.sparse_map import (
 )
 from segfloor_ros.core.slam.thresholds import (
     CHANCE_SHARE,
-    ENOUGH,
     MAJORITY,
     NEARLY_ALL,
     POINTS_PER_KEYFRAME,
@@ -277,17 +278,19 @@ def seen_ahead_m(mount: Mount) -> float:
     return mount.forward_m + AHEAD / 2 * mount.height_m
 
 
-def motion_between(view: GroundView, other: GroundView, height_m: float) -> Array | None:
-    """Return T_base_other (4, 4), where the base stood at another view of the same floor; None
-    where too little is the same, or another motion fits as well.
+def motion_between(
+    view: GroundView, other: GroundView, height_m: float
+) -> tuple[Array, float] | None:
+    """Return T_base_other (4, 4), where the base stood at another view of the same floor, and how
+    much likelier it is than the next best motion, in nats; None where no corners are the same.
     """
-    if min(len(view.xy_m), len(other.xy_m)) < ENOUGH:
+    if not len(view.xy_m) or not len(other.xy_m):
         return None
     matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(
         other.descriptor, view.descriptor
     )
     rows = np.array([(m.queryIdx, m.trainIdx) for m in matches], np.intp).reshape(-1, 2)
-    if len(rows) < ENOUGH:
+    if len(rows) < 2:
         return None
     # Complex numbers are motions in the plane: q = turn * p + shift.
     p, q = (xy @ (1.0, 1j) for xy in (other.xy_m[rows[:, 0]], view.xy_m[rows[:, 1]]))
@@ -302,17 +305,16 @@ def motion_between(view: GroundView, other: GroundView, height_m: float) -> Arra
     shift = q[draws[:, 0]] - turn * p[draws[:, 0]]
     fits = np.abs(turn[:, None] * p + shift[:, None] - q) < tolerance_m
     count = fits.sum(axis=1)
-    best = int(count.argmax()) if len(count) else 0
-    if len(count) == 0 or count[best] < ENOUGH:
+    if len(count) == 0:
         return None
+    best = int(count.argmax())
     middle = p[fits[best]].mean()
     elsewhere = np.abs((turn - turn[best]) * middle + shift - shift[best]) > 2 * tolerance_m
-    if (count[elsewhere] > MAJORITY * count[best]).any():
-        return None
+    log_ratio = of_counts(count[best], count[elsewhere].max(initial=0))
     p, q = p[fits[best]], q[fits[best]]
     turn_by = ((q - q.mean()) * (p - p.mean()).conj()).sum()
     turn_by /= np.abs(turn_by)
     shift_by = q.mean() - turn_by * p.mean()
     c, s = turn_by.real, turn_by.imag
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return make_transform(R, np.array([shift_by.real, shift_by.imag, 0.0]))
+    return make_transform(R, np.array([shift_by.real, shift_by.imag, 0.0])), log_ratio

@@ -8,28 +8,21 @@ from hand_made_maps import CAMERA, SCENES, add, keyframe, row_of_views, seen
 
 from segfloor_ros.core.contracts import NO_POINT, Mount
 from segfloor_ros.core.geometry import make_transform
-from segfloor_ros.core.slam.places.loops import (
-    DRIFT_PER_M,
-    FREE_DRIFT,
-    PlaceMatcher,
-    objection_to_drift,
-)
+from segfloor_ros.core.slam.places.evidence import PlaceEvidence
+from segfloor_ros.core.slam.places.loops import PlaceMatcher, is_no_drift, likely_drift
 from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.core.slam.rig import Observations, Rig
 from segfloor_ros.core.slam.sparse_map import Match, SparseMap
-from segfloor_ros.core.slam.thresholds import PROOF
 from segfloor_ros.core.twists import se3_exp
 
 MOUNT = Mount(0.4, 0.15)
 POINTS = SCENES['wall']
 ROWS = np.arange(len(POINTS))
 NONE = np.zeros(0, np.int32)
-REACH = tuple(free + 5.0 * per_m for free, per_m in zip(FREE_DRIFT, DRIFT_PER_M, strict=True))
-"""How far a way of 5 m can have drifted."""
 
 
 def matcher(sparse_map):
-    return PlaceMatcher(sparse_map, sparse_map, PlaceRecognition(sparse_map), PROOF)
+    return PlaceMatcher(sparse_map, sparse_map, PlaceRecognition(sparse_map))
 
 
 def objection(centre, drift, own=ROWS, farther=0.0):
@@ -49,7 +42,10 @@ def objection(centre, drift, own=ROWS, farther=0.0):
     pose = make_transform(np.eye(3), -centre)
     match = Match(1, 0, pose, ROWS, ROWS.astype(np.int32), ROWS.astype(np.int32))
     sparse_map.xyz_world[ROWS] *= 1.0 - farther
-    return objection_to_drift(now, match, REACH) or matcher(sparse_map).objection(now, match)
+    if is_no_drift(now, match):
+        return 'no drift'
+    travel = likely_drift(now, match, 5.0)
+    return matcher(sparse_map).evidence(now, match, travel).objection
 
 
 def test_a_place_seen_again_after_a_drift_is_sound():
@@ -95,5 +91,6 @@ def test_three_keyframes_on_the_move_must_show_the_same_drift(views, drifts_m, e
     for index, drift_m in zip(views, drifts_m, strict=True):
         drift = se3_exp(np.array([drift_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
         pose = sparse_map.keyframes[index].T_camera_world @ drift
-        are_certain = sightings.add(Match(index, 0, pose, NONE, NONE, NONE))
+        view = PlaceEvidence(look=20.0)
+        are_certain = sightings.add((Match(index, 0, pose, NONE, NONE, NONE), view))
     assert are_certain is expected

@@ -16,12 +16,12 @@ from segfloor_ros.core.plugins.maps.map_arrays import fill_map, map_to_arrays, m
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.slam.mapping import back_end
 from segfloor_ros.core.slam.mapping.bundle_adjustment import move_keyframes
+from segfloor_ros.core.slam.places.evidence import HOPELESS
 from segfloor_ros.core.slam.places.loop_closing import apply_closing, plan_closing, solve_closing
-from segfloor_ros.core.slam.places.loops import PlaceMatcher, objection_to_drift
+from segfloor_ros.core.slam.places.loops import PlaceMatcher, is_no_drift
 from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import LoopEdge, Match, SparseMap
-from segfloor_ros.core.slam.thresholds import PROOF
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 from segfloor_ros.core.twists import se3_exp
 
@@ -113,8 +113,8 @@ def test_a_robot_that_is_back_stands_on_the_same_floor(closed, up_m, tilt_rad, e
     none = np.zeros(0, np.int32)
     pose = invert(T_place_now) @ place.T_camera_world
     match = Match(1, 0, pose, none, none, none)
-    matcher = PlaceMatcher(slam.map, slam.map, slam.back_end.places, PROOF)
-    assert matcher.is_level(match) is expected
+    matcher = PlaceMatcher(slam.map, slam.map, slam.back_end.places)
+    assert (matcher.level(match) >= HOPELESS) is expected
 
 
 def test_what_a_loop_says_is_less_sure_than_what_neighbours_say(closed):
@@ -239,18 +239,18 @@ def closing_loops(closed, monkeypatch, background):
 
 
 @pytest.mark.parametrize(
-    ('points', 'objection'), [(0, 'no drift'), (3, '')], ids=['by the floor', 'by points']
+    ('points', 'expected'), [(0, True), (3, False)], ids=['by the floor', 'by points']
 )
-def test_a_turn_that_the_floor_cannot_measure_is_no_drift(closed, points, objection):
+def test_a_turn_that_the_floor_cannot_measure_is_no_drift(closed, points, expected):
     slam, _ = closed
     keyframe = slam.map.keyframes[-1]
     turn = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(0.3), 0.0]))
     rows = np.arange(points)
     pose = turn @ keyframe.T_camera_world
     match = Match(keyframe.index, 0, pose, rows, rows.astype(np.int32), rows.astype(np.int32))
-    assert objection_to_drift(keyframe, match, (1.0, 1.0)) == objection
+    assert is_no_drift(keyframe, match) is expected
     sigma_rad = plan_closing(slam.map, [match]).graph.sigma[-1, 3:]
-    assert ((sigma_rad > np.radians(0.3)) == (objection != '')).all()
+    assert ((sigma_rad > np.radians(0.3)) == expected).all()
 
 
 @pytest.mark.parametrize('is_bounded', [False, True])

