@@ -63,6 +63,7 @@ from segfloor_ros.core.floor.mask.likelihood import (
     with_floor,
     without_floor,
 )
+from segfloor_ros.core.floor.mask.look import unlike_floor
 from segfloor_ros.core.floor.mask.pixel_evidence import (
     TEXTURE_WINDOW_PX,
     Comparison,
@@ -78,7 +79,6 @@ from segfloor_ros.core.floor.mask.pixel_evidence import (
     mean_height,
     row_slope,
     texture_grey,
-    unlike_floor,
 )
 from segfloor_ros.core.floor.plane.plane import PROVED, Fixture, expectations, plane_of_frame
 from segfloor_ros.core.floor.scan import FloorScanner, OverheadMatcher
@@ -207,10 +207,10 @@ class FloorSegmentation:
                 view, profile, below, evidence, left_rows, textured, compared, below_said
             )
         with measure('likelihood'):
-            seen = self._seen(
+            pixels = self._seen(
                 view, below, texture / enough, left_rows, heights, compared, noise, mask
             )
-            mask = drop_islands(weighed(mask, self.likelihood.of(seen), seen.floor_px))
+            mask = drop_islands(weighed(mask, self.likelihood.of(pixels), pixels.floor_px))
             if not (is_fixed or is_proved):
                 mask[mask == FLOOR] = NO_EVIDENCE
             clear_hidden(mask, moving, columns)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,6 +25,8 @@ from numpy.typing import NDArray
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE
 from segfloor_ros.core.floor.disparity.matching import NOISE_PX, NOISE_SLOPE, SAME_PX, SIGMAS
 from segfloor_ros.core.floor.disparity.profile import STEP_PX
+from segfloor_ros.core.floor.mask.look import sigmas_off_floor
+from segfloor_ros.core.geometry import Array
 
 Picture = NDArray[np.float32]
 
@@ -80,12 +83,6 @@ _RISE_SIGMA_PX = 0.7, 2.0
 _UNEQUAL_GREY = 0.8, 0.3
 """Mean difference of both images of the same thing: so many sigmas of noise, and grey levels."""
 
-_SAMPLED, _FITS, _LEAST_SAMPLES = 4, 4, 20
-"""Every such row and column, one independent of the other, tells how light falls on the floor; so
-often it is asked; of fewer it is not known."""
-_DIRT = 0.1
-"""By such a share of its brightness a floor varies: dust, wear."""
-_FLAT = np.diag(np.array([1e-6, 1e-6, 1e-6, 1e-3, 1e-3, 1e-3], np.float32))
 _BINS, _END = 2, 10
 """Of the histogram of brightness, per sigma of the floor's; it ends at so many sigmas."""
 _FAR, _LOOK_NATS = 5.0, (-4.0, 3.0)
@@ -254,71 +251,16 @@ def _look(grey: Picture, is_floor: NDArray[np.bool_]) -> tuple[Picture, Picture,
     """Return the log ratio of how likely the brightness of each pixel is of the floor to how often
     one so far from the floor's is seen, and by how many sigmas more than two it is darker, and
     brighter.
-
-    A sun, a lamp, a lens and dust change the floor's brightness slowly: its logarithm is taken for
-    a quadratic of row and column. It is fitted again without what stood out.
     """
-    brightness = cv2.log(grey + 1)
-    part = np.s_[::_SAMPLED, ::_SAMPLED]
-    y, x = (np.linspace(-1, 1, size, dtype=np.float32) for size in grey.shape)
-    at = [axis[part] for axis in np.meshgrid(x, y)]
-    terms, seen = _quadratic(*at), brightness[part]
-    on = np.flatnonzero(is_floor[part])
-    if len(on) < _LEAST_SAMPLES:
-        return np.zeros_like(grey), np.zeros_like(grey), np.zeros_like(grey)
-    of_floor, seen = terms[:, on], seen.ravel()[on]
-    counted = np.ones(len(on), np.float32)
-    for _ in range(_FITS):
-        weighted = of_floor * (counted / counted.sum())
-        # A few pixels do not tell how it bends.
-        bends = weighted @ of_floor.T + _FLAT
-        light = np.linalg.solve(bends, weighted @ seen)
-        squares = (seen - light @ of_floor) ** 2
-        variance = float(squares @ counted) / float(counted.sum()) + _DIRT**2
-        counted = (squares < SIGMAS**2 * variance).astype(np.float32)
-    unsure = 1 + np.einsum('an,an->n', terms, np.linalg.solve(bends, terms)) / counted.sum()
-    size = grey.shape[::-1]
-    of_light = cv2.resize(unsure.reshape(at[0].shape).astype(np.float32), size)
-    # Grey levels are whole: no surface is known better.
-    deviation = np.sqrt(variance * of_light + 1 / (grey + 1) ** 2)
-    sigmas = (brightness - _expected(light, x, y)) / deviation
+    sigmas = sigmas_off_floor(grey, is_floor, STEP_PX)
     bins = np.clip(sigmas * _BINS + _END * _BINS + 0.5, 0, 2 * _END * _BINS).astype(np.intp)
     often = np.bincount(bins[::2, ::2].ravel(), minlength=2 * _END * _BINS + 1) + 1.0
     often = np.convolve(often, (0.25, 0.5, 0.25), 'same')
     log_often = np.log(often * (_BINS / often.sum())).astype(np.float32)
-    by_look = -0.5 * sigmas**2 - np.float32(0.5 * math.log(2 * math.pi)) - log_often[bins]
-    dark, bright = np.clip(-sigmas - SIGMAS, 0, _FAR), np.clip(sigmas - SIGMAS, 0, _FAR)
-    return np.clip(by_look, *_LOOK_NATS), dark, bright
-
-
-def _quadratic(x: Picture, y: Picture) -> Picture:
-    """Return the terms (6, N) of a quadratic of places (N,)."""
-    x, y = x.ravel(), y.ravel()
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
-
-
-def _expected(light: Picture, x: Picture, y: Picture) -> Picture:
-    """Return the values (len(y), len(x)) of a quadratic."""
-    one, across, down, across2, both, down2 = light.astype(np.float32)
-    by_row = (one + down * y + down2 * y * y)[:, None]
-    values: Picture = by_row + (across + both * y)[:, None] * x + across2 * x * x
-    return values
-
-
-def _kept(difference: Picture, edge: np.float32) -> Picture:
-    """Return the share of what a pixel knows that its neighbour gets."""
-    kept: Picture = np.exp(-math.sqrt(2) * (1 / _REACH_PX + np.maximum(difference / edge - 0.5, 0)))
-    return kept.astype(np.float32)
-
-
-def _along(values: Picture, kept: Picture) -> Picture:
-    """Return values (N, 2, m) passed on along the first axis, forth and back. kept: (N - 1, m)."""
-    values, kept = np.ascontiguousarray(values), np.ascontiguousarray(kept)
-    for i in range(1, len(values)):
-        values[i] += kept[i - 1] * (values[i - 1] - values[i])
-    for i in range(len(values) - 2, -1, -1):
-        values[i] += kept[i] * (values[i + 1] - values[i])
-    return values
+    ratio = -0.5 * sigmas**2 - np.float32(0.5 * math.log(2 * math.pi)) - log_often[bins]
+    look = np.clip(ratio, *_LOOK_NATS) * is_floor.any()
+    dark, bright = (np.clip(off - SIGMAS, 0, _FAR) for off in (-sigmas, sigmas))
+    return look, dark, bright
 
 
 def passed_on(alone: Picture, grey: Picture, noise_grey: float) -> Picture:
@@ -375,8 +317,8 @@ class Likelihood:
 
     def __init__(
         self,
-        weights: Sequence[float] = tuple(WEIGHTS.values()),
-        combined: Sequence[float] = PASSED_ON,
+        weights: Sequence[float] | Array = tuple(WEIGHTS.values()),
+        combined: Sequence[float] | Array = PASSED_ON,
     ) -> None:
         self.weights = np.array(weights, np.float32)
         self.combined = np.array(combined, np.float32)
@@ -421,7 +363,7 @@ def _changed(mask: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.ui
     return mask ^ (where.view(np.uint8) * np.uint8(NO_EVIDENCE ^ FLOOR))
 
 
-def enlarged(picture: NDArray[np.bool_], mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return a picture of half the resolution (h, w) in the size of a mask (R, W)."""
-    size = (mask.shape[1], mask.shape[0])
+def enlarged(picture: NDArray[np.bool_], like: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return a picture of half the resolution (h, w) in the size of another (R, W)."""
+    size = (like.shape[1], like.shape[0])
     return cv2.resize(picture.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0

@@ -1,9 +1,6 @@
 """What each pixel says: floor, not floor, or nothing.
 
 A pixel is judged by its own disparity: its height above the floor that has the same disparity.
-Where there is no texture, how bright a surface is tells it from the floor around it: a black tyre,
-the shade below a car. What looks like no more than a few of the floor's own pixels is floor only if
-that was measured.
 
 The floor is tested on the images themselves, too. Semi-global matching prefers surfaces that face
 the camera and, where texture is weak, agrees with whatever repeats: the blocks of a compressed
@@ -43,13 +40,6 @@ _NEIGHBOURS_PX = 9
 """Heights are averaged over so wide a square; ones that are matched err together."""
 _MOST_SIGMAS = np.float32(10)
 _LEAST_KNOWN = 0.2
-
-_DIRT = 0.1
-"""By such a share of its brightness a floor varies: dust, wear."""
-_SAMPLED, _FITS = 8, 4
-"""Every such row and column, one independent of the other, tells how light falls on the floor; so
-often it is asked."""
-_FLAT = np.diag(np.array([1e-6, 1e-6, 1e-6, 1e-3, 1e-3, 1e-3], np.float32))
 
 _AGAINST_GREY = 1.0
 """By how much the images must contradict the floor to deny it, beyond their noise."""
@@ -274,47 +264,6 @@ def _below_contact(
     ends = np.bincount(end * np.int32(width) + columns, minlength=size)
     covered -= ends.reshape(-1, width).astype(np.int16)
     return np.cumsum(covered, axis=0, dtype=np.int16)[:height] >= 2
-
-
-def unlike_floor(image: NDArray[np.uint8], floor: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which pixels of an image (R, W) are darker or brighter than nearly all of the floor
-    (R, W) would be there.
-
-    A sun, a lamp, a lens and dust change the floor's brightness slowly: its logarithm is taken for
-    a quadratic of row and column. What is measured as floor may be a thing that is hardly higher:
-    it is fitted again without what stood out.
-    """
-    grey = cv2.blur(image, (BLOCK_PX, BLOCK_PX)).astype(np.float32) + 1
-    brightness = cv2.log(grey)
-    y, x = (np.linspace(-1, 1, size, dtype=np.float32) for size in image.shape)
-    part = np.s_[::_SAMPLED, ::_SAMPLED]
-    rows, columns = np.nonzero(floor[part])
-    if len(rows) == 0:
-        return np.zeros(image.shape, np.bool_)
-    terms = _quadratic(x[::_SAMPLED][columns], y[::_SAMPLED][rows])
-    seen = brightness[part][rows, columns]
-    counted = np.ones(len(rows), np.float32)
-    for _ in range(_FITS):
-        weighted = terms * counted
-        weighted /= counted.sum()
-        # A few pixels do not tell how it bends.
-        bends = weighted @ terms.T + _FLAT
-        light = np.linalg.solve(bends, weighted @ seen)
-        squares = (seen - light @ terms) ** 2
-        variance = float(squares @ counted) / float(counted.sum()) + _DIRT**2
-        counted = (squares < SIGMAS**2 * variance).astype(np.float32)
-    one, across, down, across2, both, down2 = light
-    expected = (one + down * y + down2 * y * y)[:, None] + (across + both * y)[:, None] * x
-    expected += across2 * x * x
-    at = _quadratic(*(axis.ravel() for axis in np.meshgrid(x[::_SAMPLED], y[::_SAMPLED])))
-    of_light = np.einsum('an,an->n', at, np.linalg.solve(bends, at)) / counted.sum()
-    unsure = cv2.resize(1 + of_light.reshape(brightness[part].shape), image.shape[::-1])
-    # Grey levels are whole: no surface is known better.
-    return (brightness - expected) ** 2 > SIGMAS**2 * (variance * unsure + 1 / grey**2)
-
-
-def _quadratic(x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
 
 
 def compare(

@@ -5,7 +5,7 @@ import pytest
 from floor_scenes import FLOORS, Scene, box, floor_patch, wall
 
 from segfloor_ros.core.contracts import FLOOR
-from segfloor_ros.core.floor.mask.pixel_evidence import unlike_floor
+from segfloor_ros.core.floor.mask.look import unlike_floor
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
