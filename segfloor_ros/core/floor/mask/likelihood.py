@@ -58,6 +58,7 @@ often it is seen. dark, bright: by how many sigmas more than two it is darker, b
 floor. shared: whether the right camera sees it.
 """
 
+_IN_ORDER = tuple(WEIGHTS.values())
 PASSED_ON = 0.11, 0.89, 1.31
 """What a pixel has of itself, and of what is passed on to it: a constant, and weights."""
 
@@ -317,7 +318,7 @@ class Likelihood:
 
     def __init__(
         self,
-        weights: Sequence[float] | Array = tuple(WEIGHTS.values()),
+        weights: Sequence[float] | Array = _IN_ORDER,
         combined: Sequence[float] | Array = PASSED_ON,
     ) -> None:
         self.weights = np.array(weights, np.float32)

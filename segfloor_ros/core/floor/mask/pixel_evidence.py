@@ -313,7 +313,8 @@ def compare(
     contradicted = (against, denied, unlike)
     masks = (*(mask & reached for mask in contradicted), ~(contrary & reached))
     costs = Costs(floor, matched, reached.astype(np.float32))
-    return Comparison(floor_px, *(enlarged(mask, disparity) for mask in masks), costs)
+    against, denied, unlike, consistent = (enlarged(mask, disparity) for mask in masks)
+    return Comparison(floor_px, against, denied, unlike, consistent, costs)
 
 
 def compare_measured(
