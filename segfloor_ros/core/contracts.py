@@ -244,7 +244,8 @@ class FrameResult:
 
 
 FLOOR, NO_EVIDENCE, MOVING, NOT_FLOOR = 255, 127, 64, 0
-"""Pixels of a mask. What moves is in what a network says alone: neither floor nor in the way."""
+"""Pixels of a mask: floor, not known, and what stands there. What moves is in what a network says
+alone: neither floor nor in the way."""
 
 RANGE_MAX_ERROR_M = 0.3
 SAME_SURFACE_SHARE = 0.06

@@ -214,6 +214,7 @@ def test_without_rerun_one_line_says_how_to_install_it(recording, tmp_path, monk
         ('run drive --view x.rrd', 'run drive --view x.rrd'),
         ('run drive --view', 'run drive --view='),
         ('run drive --view=x.rrd', 'run drive --view=x.rrd'),
+        ('', ''),
     ],
 )
 def test_the_file_of_a_view_may_be_left_out(words, read):

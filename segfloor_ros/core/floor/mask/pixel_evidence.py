@@ -184,7 +184,7 @@ def judge(
     may_be = textured & near & ~off
     mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
     mask[may_be & ~(compared.against | compared.unlike)] = FLOOR
-    mask[off & sure] = NOT_FLOOR
+    mask[above & sure] = NOT_FLOOR
     up = table.up.take(heights.index)
     low = above & sure & (heights.height < up + np.float32(_CONTACT_HEIGHT_M))
     mask[_below_contact(view, table.row, heights.index, low)] = NOT_FLOOR
