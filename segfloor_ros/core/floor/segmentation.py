@@ -210,7 +210,7 @@ class FloorSegmentation:
             pixels = self._seen(
                 view, below, texture / enough, left_rows, heights, compared, noise, mask
             )
-            mask = drop_islands(weighed(mask, self.likelihood.of(pixels), pixels.floor_px))
+            mask = drop_islands(weighed(mask, self.likelihood.of(pixels), pixels))
             if not (is_fixed or is_proved):
                 mask[mask == FLOOR] = NO_EVIDENCE
             clear_hidden(mask, moving, columns)
@@ -264,6 +264,7 @@ class FloorSegmentation:
             slope=view.line.slope,
             texture=texture[part],
             overhead=above / heights.table.noise.take(index),
+            lower=(heights.off & ~heights.above)[part],
             grey=grey,
             costs=compared.costs,
             noise_grey=noise,

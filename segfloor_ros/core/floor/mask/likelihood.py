@@ -116,8 +116,8 @@ class Seen:
 
     first_row: of the image. floor_px, disparity_px: disparity of the floor, and the matched one, 0
     where none is. slope: of a floor's disparity, per row of the image. texture: as many times of
-    what is surely no noise.
-    overhead: by how many sigmas it is higher than what a robot climbs. grey: brightness, smoothed.
+    what is surely no noise. overhead: by how many sigmas it is higher than what a robot climbs.
+    lower: bool, what lies deeper than a robot may drop. grey: brightness, smoothed.
     costs: None of a depth camera. noise_grey: of the images. is_floor: bool, what is floor so far.
     """
 
@@ -127,6 +127,7 @@ class Seen:
     slope: float
     texture: Picture
     overhead: Picture
+    lower: NDArray[np.bool_]
     grey: Picture
     costs: Costs | None
     noise_grey: float
@@ -340,13 +341,14 @@ class Likelihood:
         return np.clip(ratio, -_MOST_ALONE, _MOST_ALONE)
 
 
-def weighed(mask: NDArray[np.uint8], likely: Likely, floor_px: Picture) -> NDArray[np.uint8]:
+def weighed(mask: NDArray[np.uint8], likely: Likely, seen: Seen) -> NDArray[np.uint8]:
     """Return a mask (R, W) without floor that is not likely, and with what is surely floor, where
-    that is measured. floor_px: (h, w), disparity of the floor.
+    that is measured. What lies too low for a robot is a drop, or what a floor mirrors, and no floor
+    however it looks.
     """
-    judged = likely.measured & (floor_px > LEAST_FLOOR_PX)
+    judged = likely.measured & (seen.floor_px > LEAST_FLOOR_PX)
     unlikely = judged & (likely.alone < _UNLIKELY) & (likely.together < 0)
-    sure = judged & (likely.alone > _LIKELY) & (likely.together > _SURE)
+    sure = judged & ~seen.lower & (likely.alone > _LIKELY) & (likely.together > _SURE)
     return with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))
 
 

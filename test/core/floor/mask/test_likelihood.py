@@ -40,6 +40,7 @@ def ground(seed: int = 0) -> Seen:
         slope=SLOPE,
         texture=np.full(SHAPE, 2.0, np.float32),
         overhead=np.full(SHAPE, -1.0, np.float32),
+        lower=np.zeros(SHAPE, bool),
         grey=(100 + rng.normal(0, 12, SHAPE)).astype(np.float32),
         costs=costs,
         noise_grey=NOISE_GREY,
@@ -172,19 +173,21 @@ def test_a_mask_changes_only_where_something_is_measured(size: tuple[int, int]) 
     mask[: size[0] // 2] = FLOOR
     mask[:, -size[1] // 4 :] = NOT_FLOOR
     measured = COLUMNS >= 50
-    floor_px = np.full(SHAPE, 10, np.float32)
+    seen = dataclasses.replace(ground(), floor_px=np.full(SHAPE, 10, np.float32))
     surely = Likely(np.full(SHAPE, 3, np.float32), np.full(SHAPE, 4, np.float32), measured)
     unlikely = Likely(-surely.alone, -surely.together, measured)
     left, between = np.s_[:, : size[1] // 4], np.s_[:, size[1] // 4 : -size[1] // 4]
-    changed = weighed(mask, surely, floor_px)
+    changed = weighed(mask, surely, seen)
     np.testing.assert_array_equal(changed[left], mask[left])
     assert np.all(changed[between] == FLOOR)
     assert np.all(changed[:, -size[1] // 4 :] == NOT_FLOOR)
-    changed = weighed(mask, unlikely, floor_px)
+    changed = weighed(mask, unlikely, seen)
     np.testing.assert_array_equal(changed[left], mask[left])
     assert np.all(changed[between] == NO_EVIDENCE)
     assert np.all(changed[:, -size[1] // 4 :] == NOT_FLOOR)
-    far = weighed(mask, surely, np.full(SHAPE, 2, np.float32))
-    np.testing.assert_array_equal(far, mask)
-    split = weighed(mask, Likely(unlikely.alone, surely.together, measured), floor_px)
-    np.testing.assert_array_equal(split, mask)
+    far = dataclasses.replace(seen, floor_px=np.full(SHAPE, 2, np.float32))
+    np.testing.assert_array_equal(weighed(mask, surely, far), mask)
+    split = Likely(unlikely.alone, surely.together, measured)
+    np.testing.assert_array_equal(weighed(mask, split, seen), mask)
+    drop = dataclasses.replace(seen, lower=np.ones(SHAPE, bool))
+    np.testing.assert_array_equal(weighed(mask, surely, drop), mask)
