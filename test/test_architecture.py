@@ -47,7 +47,7 @@ CEILINGS = {
     'core.grid.mapper': 1400,
     'nodes.stereo_camera': 3750,
     'nodes.stereo_slam': 10225,
-    'nodes.floor_segmentation': 5280,
+    'nodes.floor_segmentation': 5285,
     'nodes.cloud_labelling': 3050,
     'nodes.occupancy_grid': 3400,
     'apps.cli.main': 415,
