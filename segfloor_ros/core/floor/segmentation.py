@@ -254,8 +254,6 @@ class FloorSegmentation:
         mask: NDArray[np.uint8],
     ) -> Seen:
         part = np.s_[::STEP_PX, :: STEP_PX // view.step]
-        index = heights.index[part]
-        above = heights.height[part] - np.float32(self._settings.step_height_m)
         grey = cv2.blur(left_rows, (5, 5))[::STEP_PX, ::STEP_PX].astype(np.float32)
         return Seen(
             first_row=view.first_row,
@@ -263,7 +261,6 @@ class FloorSegmentation:
             disparity_px=below[part],
             slope=view.line.slope,
             texture=texture[part],
-            overhead=above / heights.table.noise.take(index),
             lower=(heights.off & ~heights.above)[part],
             grey=grey,
             costs=compared.costs,

@@ -31,35 +31,25 @@ from segfloor_ros.core.geometry import Array
 Picture = NDArray[np.float32]
 
 WEIGHTS = {
-    'one': 0.49,
-    'above': -0.32,
-    'below': 0.25,
-    'rises': 0.70,
-    'steep': -1.45,
-    'on': 2.35,
-    'off': -0.29,
-    'matched': -1.21,
-    'cost': -0.04,
-    'overhead': -0.23,
-    'look': 0.69,
-    'dark': -0.30,
-    'bright': -0.60,
-    'shared': 0.43,
+    'one': 0.97,
+    'above': -0.49,
+    'rises': 0.72,
+    'steep': -1.40,
+    'on': 2.16,
+    'matched': -1.39,
+    'look': 0.90,
 }
 """By feature, made by `tools/fit_floor.py`.
 
-one: of a pixel that shows nothing. above, below: by how many sigmas it is higher, lower, than the
-floor around it. rises, steep: log ratio of likelihoods that the disparity rises down the image as
-a floor's, or as that of what is upright. on, off: share of what is around it that is on that floor,
-less that which is off. matched: log ratio of the difference of both images on the floor to that at
-the matched disparity. cost: the first of these over the noise. overhead: by how many sigmas it is
-higher than what a robot climbs. look: log ratio of how likely its brightness is of the floor to how
-often it is seen. dark, bright: by how many sigmas more than two it is darker, brighter, than the
-floor. shared: whether the right camera sees it.
+one: of a pixel that shows nothing. above: by how many sigmas it is higher than the floor around it.
+rises, steep: log ratio of likelihoods that the disparity rises down the image as a floor's, or as
+that of what is upright. on: share of what is around it that is on that floor, less that which is
+off. matched: log ratio of the difference of both images on the floor to that at the matched
+disparity. look: log ratio of how likely its brightness is of the floor to how often it is seen.
 """
 
 _IN_ORDER = tuple(WEIGHTS.values())
-PASSED_ON = 0.11, 0.89, 1.33
+PASSED_ON = 0.11, 0.89, 1.35
 """What a pixel has of itself, and of what is passed on to it: a constant, and weights."""
 
 _SURE, _LIKELY, _UNLIKELY = (math.log(p / (1 - p)) for p in (0.95, 0.75, 0.4))
@@ -86,7 +76,7 @@ _UNEQUAL_GREY = 0.8, 0.3
 
 _BINS, _END = 2, 10
 """Of the histogram of brightness, per sigma of the floor's; it ends at so many sigmas."""
-_FAR, _LOOK_NATS = 5.0, (-4.0, 3.0)
+_LOOK_NATS = -4.0, 3.0
 _MOST_ALONE = 8.0
 """Bounds of what a look says, and of what a pixel says by itself."""
 
@@ -116,8 +106,8 @@ class Seen:
 
     first_row: of the image. floor_px, disparity_px: disparity of the floor, and the matched one, 0
     where none is. slope: of a floor's disparity, per row of the image. texture: as many times of
-    what is surely no noise. overhead: by how many sigmas it is higher than what a robot climbs.
-    lower: bool, what lies deeper than a robot may drop. grey: brightness, smoothed.
+    what is surely no noise. lower: bool, what lies deeper than a robot may drop. grey: brightness,
+    smoothed.
     costs: None of a depth camera. noise_grey: of the images. is_floor: bool, what is floor so far.
     """
 
@@ -126,7 +116,6 @@ class Seen:
     disparity_px: Picture
     slope: float
     texture: Picture
-    overhead: Picture
     lower: NDArray[np.bool_]
     grey: Picture
     costs: Costs | None
@@ -150,16 +139,9 @@ def features(seen: Seen, weight: Picture) -> Picture:
     rises = _rise(seen, weight, known)
     # What is as level as a floor is none where it is higher.
     rises = np.where(rises > 0, rises * np.exp(-(height**2) / 8), rises)
-    matched, cost, reached = _compared(seen, known)
-    overhead = np.clip(np.nan_to_num(seen.overhead), 0, _MOST_NATS) * weight
-    look, dark, bright = _look(seen.grey, seen.is_floor)
-    signed = [part for both in (height, rises, mostly_on) for part in _halves(both)]
-    return np.stack([one, *signed, matched, cost, overhead, look, dark, bright, reached])
-
-
-def _halves(values: Picture) -> tuple[Picture, Picture]:
-    """Return what is positive, and what is negative, both positive."""
-    return np.maximum(values, 0), np.maximum(-values, 0)
+    positive = (np.maximum(values, 0) for values in (height, rises, -rises, mostly_on))
+    look = _look(seen.grey, seen.is_floor)
+    return np.stack([one, *positive, _matched_better(seen, known), look])
 
 
 def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, float]) -> np.float32:
@@ -235,24 +217,22 @@ def _rise(seen: Seen, weight: Picture, known: Picture) -> Picture:
     return _mean(ratio, known, _NEAR)
 
 
-def _compared(seen: Seen, known: Picture) -> tuple[Picture, Picture, Picture]:
-    """Return what the images say: the log ratio of their difference on the floor to that at the
-    matched disparity, how much the first is more than noise, and where they say anything.
+def _matched_better(seen: Seen, known: Picture) -> Picture:
+    """Return the log ratio of how much the images differ on the floor to how much they do at the
+    matched disparity; 0 where they say nothing.
     """
     if seen.costs is None:
-        return np.zeros_like(known), np.zeros_like(known), np.ones_like(known)
+        return np.zeros_like(known)
     costs, (sigmas, grey) = seen.costs, _UNEQUAL_GREY
     noise = np.float32(sigmas * seen.noise_grey + grey)
     best = np.minimum(costs.matched, costs.floor)
-    ratio = np.log((costs.floor + noise) / (best + noise)) * known * costs.reached
-    more = np.clip(costs.floor / noise - 1, 0, _MOST_NATS) * costs.reached
-    return ratio, more, costs.reached
+    ratio: Picture = np.log((costs.floor + noise) / (best + noise)) * known * costs.reached
+    return ratio
 
 
-def _look(grey: Picture, is_floor: NDArray[np.bool_]) -> tuple[Picture, Picture, Picture]:
+def _look(grey: Picture, is_floor: NDArray[np.bool_]) -> Picture:
     """Return the log ratio of how likely the brightness of each pixel is of the floor to how often
-    one so far from the floor's is seen, and by how many sigmas more than two it is darker, and
-    brighter.
+    one so far from the floor's is seen; 0 where no floor is known.
     """
     sigmas = sigmas_off_floor(grey, is_floor, STEP_PX)
     bins = np.clip(sigmas * _BINS + _END * _BINS + 0.5, 0, 2 * _END * _BINS).astype(np.intp)
@@ -260,9 +240,8 @@ def _look(grey: Picture, is_floor: NDArray[np.bool_]) -> tuple[Picture, Picture,
     often = np.convolve(often, (0.25, 0.5, 0.25), 'same')
     log_often = np.log(often * (_BINS / often.sum())).astype(np.float32)
     ratio = -0.5 * sigmas**2 - np.float32(0.5 * math.log(2 * math.pi)) - log_often[bins]
-    look = np.clip(ratio, *_LOOK_NATS) * is_floor.any()
-    dark, bright = (np.clip(off - SIGMAS, 0, _FAR) for off in (-sigmas, sigmas))
-    return look, dark, bright
+    look: Picture = np.clip(ratio, *_LOOK_NATS) * is_floor.any()
+    return look
 
 
 def passed_on(alone: Picture, grey: Picture, noise_grey: float) -> Picture:

@@ -39,7 +39,6 @@ def ground(seed: int = 0) -> Seen:
         disparity_px=matched_px.astype(np.float32),
         slope=SLOPE,
         texture=np.full(SHAPE, 2.0, np.float32),
-        overhead=np.full(SHAPE, -1.0, np.float32),
         lower=np.zeros(SHAPE, bool),
         grey=(100 + rng.normal(0, 12, SHAPE)).astype(np.float32),
         costs=costs,
@@ -63,7 +62,7 @@ def test_a_stone_is_higher_than_the_ground_beside_it_wherever_the_profile_lies()
     parts = named(dataclasses.replace(seen, disparity_px=stone_px))
     middle = np.s_[63:67, 98:102]
     assert parts['above'][middle].min() > 2
-    assert parts['off'][middle].mean() > 0.3
+    assert not parts['on'][middle].any()
     beside = np.s_[60:70, 120:160]
     assert parts['above'][beside].mean() < 0.7
     assert parts['on'][beside].mean() > 0.5
@@ -72,14 +71,12 @@ def test_a_stone_is_higher_than_the_ground_beside_it_wherever_the_profile_lies()
     assert likely.alone[beside].mean() > 2
 
 
-def test_a_hollow_is_lower_and_no_obstacle() -> None:
+def test_a_hollow_is_no_obstacle() -> None:
     seen = ground()
     hollow_px = seen.disparity_px.copy()
     hollow_px[STONE] -= 3
     parts = named(dataclasses.replace(seen, disparity_px=hollow_px))
-    middle = np.s_[63:67, 98:102]
-    assert parts['below'][middle].min() > 2
-    assert not parts['above'][middle].any()
+    assert not parts['above'][63:67, 98:102].any()
 
 
 def test_what_is_upright_does_not_rise() -> None:
@@ -103,7 +100,7 @@ def test_what_has_no_texture_or_no_match_says_nothing_of_its_height() -> None:
         {'disparity_px': np.zeros(SHAPE, np.float32)},
     ):
         parts = named(dataclasses.replace(seen, **change))
-        for name in ('above', 'below', 'rises', 'steep', 'on', 'off'):
+        for name in ('above', 'rises', 'steep', 'on'):
             assert not parts[name].any()
     flat = dataclasses.replace(seen, grey=np.full(SHAPE, 100, np.float32))
     assert known_weight(flat).max() < 0.1 < known_weight(seen).mean()
@@ -119,12 +116,10 @@ def test_images_that_differ_on_the_floor_and_not_as_matched_deny_it() -> None:
     costs = Costs(floor, np.full(SHAPE, 1.2, np.float32), reached)
     parts = named(dataclasses.replace(seen, costs=costs))
     assert parts['matched'][:60, 100:].min() > 1.5
-    assert parts['cost'][:60, 100:].min() > 5
     for where in (np.s_[:, :100], np.s_[60:]):
         assert parts['matched'][where].max() < 0.2
-        assert parts['cost'][where].max() < 0.2
     measured = named(dataclasses.replace(seen, costs=None))
-    assert not measured['matched'].any() and not measured['cost'].any()
+    assert not measured['matched'].any()
 
 
 def test_what_is_darker_or_brighter_than_the_floor_does_not_look_like_it() -> None:
@@ -137,11 +132,10 @@ def test_what_is_darker_or_brighter_than_the_floor_does_not_look_like_it() -> No
     is_floor = np.ones(SHAPE, bool)
     is_floor[STONE] = is_floor[20:30, 95:105] = False
     parts = named(dataclasses.replace(seen, grey=grey, is_floor=is_floor))
-    assert parts['dark'][STONE].mean() > 2
-    assert parts['bright'][20:30, 95:105].mean() > 1
-    rest = is_floor & (parts['dark'] + parts['bright'] > 0.5)
-    assert rest.mean() < 0.05
-    assert parts['look'][is_floor].mean() > -0.1 > -1 > parts['look'][STONE].mean()
+    assert parts['look'][is_floor].mean() > -0.1
+    assert np.mean(parts['look'][is_floor] < -1) < 0.05
+    assert parts['look'][STONE].mean() < -1
+    assert parts['look'][20:30, 95:105].mean() < -1
     few = named(dataclasses.replace(seen, is_floor=np.zeros(SHAPE, bool)))
     assert not few['look'].any()
 
