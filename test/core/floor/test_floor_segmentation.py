@@ -142,10 +142,10 @@ def test_blank_floor_is_filled_to_the_foot_of_what_stands_on_it(seed, grey):
     textured = floor_patch(far_m=1.0, seed=seed, grey=grey, contrast=9.0)
     scene = Scene([textured, *blank, wall(1.6)], SMALL_CAMERA)
     observation, floor, depth = segment(scene)
-    # The last rows before the wall look like both, and have the disparity of the wall.
-    lit = floor & (np.abs(points_of(scene, depth)[..., 0] - 1.35) < 0.09)
+    # The last rows before the wall look like both.
+    lit = floor & (np.abs(points_of(scene, depth)[..., 0] - 1.4) < 0.1)
     assert lit.sum() > 1000
-    assert np.mean(observation.mask[lit] == FLOOR) > 0.8
+    assert np.mean(observation.mask[lit] == FLOOR) > 0.9
     assert np.mean(observation.mask[~floor] == FLOOR) < 0.01
 
 
@@ -198,7 +198,7 @@ def test_a_step_at_the_foot_of_what_stands_is_no_sill(x_m):
     assert np.mean(observation.mask[step] == FLOOR) <= 0.1
 
 
-@pytest.mark.parametrize(('stands', 'least', 'most'), [(False, 0.94, 1.0), (True, 0.0, 0.1)])
+@pytest.mark.parametrize(('stands', 'least', 'most'), [(False, 0.97, 1.0), (True, 0.0, 0.02)])
 def test_what_looks_like_what_stands_on_it_is_not_floor(stands, least, most):
     """A dark patch alone is: it was measured."""
     dark = {'contrast': 10.0, 'grey': 25.0}

@@ -31,13 +31,13 @@ from segfloor_ros.core.geometry import Array
 Picture = NDArray[np.float32]
 
 WEIGHTS = {
-    'one': 0.97,
-    'above': -0.49,
-    'rises': 0.72,
-    'steep': -1.40,
-    'on': 2.16,
-    'matched': -1.39,
-    'look': 0.90,
+    'one': 0.68,
+    'above': -0.41,
+    'rises': 0.88,
+    'steep': -1.83,
+    'on': 2.05,
+    'matched': -1.48,
+    'look': 0.93,
 }
 """By feature, made by `tools/fit_floor.py`.
 
@@ -49,7 +49,7 @@ disparity. look: log ratio of how likely its brightness is of the floor to how o
 """
 
 _IN_ORDER = tuple(WEIGHTS.values())
-PASSED_ON = 0.11, 0.89, 1.35
+PASSED_ON = 0.12, 0.89, 1.35
 """What a pixel has of itself, and of what is passed on to it: a constant, and weights."""
 
 _SURE, _LIKELY, _UNLIKELY = (math.log(p / (1 - p)) for p in (0.95, 0.75, 0.4))
@@ -137,8 +137,9 @@ def features(seen: Seen, weight: Picture) -> Picture:
     one = np.ones_like(known)
     height, mostly_on = _local_height(seen, weight, known)
     rises = _rise(seen, weight, known)
-    # What is as level as a floor is none where it is higher.
-    rises = np.where(rises > 0, rises * np.exp(-(height**2) / 8), rises)
+    # What is as level as a floor is none where it is higher, and what stands on it is higher.
+    is_higher = 1 - np.exp(-(np.maximum(height, 0) ** 2) / 2)
+    rises *= np.where(rises > 0, np.exp(-(height**2) / 8), is_higher)
     positive = (np.maximum(values, 0) for values in (height, rises, -rises, mostly_on))
     look = _look(seen.grey, seen.is_floor)
     return np.stack([one, *positive, _matched_better(seen, known), look])

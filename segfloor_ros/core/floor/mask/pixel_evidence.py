@@ -193,7 +193,19 @@ def judge(
     # where above a foot there is what stands on it.
     sill = compared.against & (np.abs(heights.height) <= np.float32(step_m))
     mask[may_be & sill & below_floor(mask)] = FLOOR
+    mask[
+        (mask == FLOOR) & ~most_around(mask == FLOOR, textured & near & (off | (mask == FLOOR)))
+    ] = NO_EVIDENCE
     return mask
+
+
+def most_around(said: NDArray[np.bool_], measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return around which pixels (R, W) most of what is measured (R, W) says something (R, W): some
+    of what is matched wrongly lies on the floor by chance.
+    """
+    window = (_WIDE_WINDOW, _WIDE_WINDOW)
+    of_all, of_said = (cv2.blur(part.astype(np.float32), window) for part in (measured, said))
+    return np.asarray(of_said >= np.float32(0.5) * of_all)
 
 
 def below_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:

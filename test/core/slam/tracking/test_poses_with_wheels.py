@@ -64,9 +64,8 @@ def alone(frames):
 def test_the_offset_of_the_rig_pulls_no_pose(on_wheels, alone):
     """Points that are seen 0.6 px too near would put the camera 2 mm or more ahead."""
     for poses, _ in (on_wheels, alone):
-        errors_m = np.stack([(invert(base_at(k)) @ T)[:3, 3] for k, T in enumerate(poses)])
-        assert np.abs(errors_m[:, 0]).max() < 0.0015
-        assert np.abs(errors_m).max() < 0.002
+        errors_m = [(invert(base_at(k)) @ T)[:3, 3] for k, T in enumerate(poses)]
+        assert np.abs(errors_m).max() < 0.0015
 
 
 def test_sensors_learn_from_what_the_images_alone_show(on_wheels, alone):
