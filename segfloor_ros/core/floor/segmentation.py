@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.camera.pixels import BlankBorder, noise_grey, union
+from segfloor_ros.core.camera.pixels import BlankBorder, union
 from segfloor_ros.core.contracts import (
     FLOOR,
     MOVING,
@@ -31,7 +31,6 @@ from segfloor_ros.core.floor.disparity.matching import (
     SIGMAS,
     TwoScaleMatcher,
     disparity_range,
-    stereo_view,
 )
 from segfloor_ros.core.floor.disparity.profile import (
     BINS_PER_PX,
@@ -56,14 +55,9 @@ from segfloor_ros.core.floor.mask.filling import (
     trim_to_edges,
     upright_above,
 )
-from segfloor_ros.core.floor.mask.likelihood import (
-    Likelihood,
-    Seen,
-    weighed,
-    with_floor,
-    without_floor,
-)
+from segfloor_ros.core.floor.mask.likelihood import Likelihood, Seen, weighed
 from segfloor_ros.core.floor.mask.look import unlike_floor
+from segfloor_ros.core.floor.mask.painting import with_floor, without_floor
 from segfloor_ros.core.floor.mask.pixel_evidence import (
     TEXTURE_WINDOW_PX,
     Comparison,
@@ -73,13 +67,11 @@ from segfloor_ros.core.floor.mask.pixel_evidence import (
     below_floor,
     compare,
     compare_measured,
-    enough_texture,
     judge,
     lies_on_floor,
     mean_height,
-    row_slope,
-    texture_grey,
 )
+from segfloor_ros.core.floor.pair import Pair
 from segfloor_ros.core.floor.plane.plane import PROVED, Fixture, expectations, plane_of_frame
 from segfloor_ros.core.floor.scan import FloorScanner, OverheadMatcher
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
@@ -87,7 +79,6 @@ from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.timing import NoTimes, StageTimes
 
 DISPARITY, DISPARITY_ABOVE = 'disparity', 'disparity above the horizon'
-_PLAIN_TO_SEE = 100.0
 _BORDER_BLOCKS = 2
 """So near to the border of the right image, in blocks that are matched, matches are unsure."""
 _LEAST_SHARE = 0.5
@@ -141,87 +132,36 @@ class FloorSegmentation:
         """
         measure = self._times.measure
         self._prepare(mount)
-        expected = expectations(mount, T_map_base)
-        expected = np.vstack([expected, self.fixture.usual(expected[0])])
-        first_row = min(first_floor_row(self._camera, _with_angles(mount, one)) for one in expected)
-        columns = np.s_[first_row:, :: column_step(self._camera)]
+        expected = self._expected(mount, T_map_base)
         with measure('texture'):
-            moving = union(moving, self._border.see(left))
-            if said is not None:
-                moving = union(moving, np.where(said == MOVING, np.uint8(255), np.uint8(0)))
-            right, measured = stereo_view(left, right)
-            left_rows, right_rows = left[first_row:], right[first_row:]
-            noise = noise_grey(left_rows)
-            enough = enough_texture(noise)
-            texture = texture_grey(left_rows, TEXTURE_WINDOW_PX)[:, columns[1]]
-            if measured is not None:
-                # Depth is measured on plain surfaces, too; a hole in it tells nothing.
-                plain = np.float32(_PLAIN_TO_SEE * enough)
-                texture = np.where(measured[columns] > 0, plain, np.float32(0))
+            part = self._part(mount, expected)
+            pair = Pair.of(left, right, self._hidden(left, moving, said), said, part)
         with measure(DISPARITY):
-            disparity = self._disparity(first_row, left, right) if measured is None else measured
-            movable = None
-            if said is not None:
-                movable = np.where(said == MOVING, disparity, np.float32(0))
-                disparity[said == NOT_FLOOR] = 0
-            if moving is not None:
-                disparity[moving > 0] = 0
-        below, textured = disparity[columns], texture > enough
+            disparity, movable = self._disparities(pair)
+            below = disparity[part]
         with measure('plane'):
-            is_fixed = self.fixture.problem is None
-            seen = self._camera, first_row, below, texture, enough, expected
-            fit = plane_of_frame(*seen, is_fixed)
-            is_proved = fit.evidence > PROVED
-            is_lost = is_fixed and not is_proved
-            self.fixture.note(plane_of_frame(*seen, is_fixed=False) if is_lost else fit)
-        view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
+            angles_height, is_shown = self._plane(pair, below, expected)
+        view = FloorView.of(self._camera, _with_angles(mount, angles_height), pair.first_row)
         with measure('profile'):
-            most = self._matcher.num_disparities
-            counted = filtered_v_disparity(view, below, texture > 2 * enough, most, BINS_PER_PX)
+            counted = self._counted(view, pair, below)
             profile = fit_profile(counted, view.line, self._camera)
         with measure('comparison'):
-            heights = self._heights(view, profile, below, measured is not None)
-            on_floor = lies_on_floor(view, below, heights)
-            if measured is None:
-                compared = compare(view, profile, left_rows, right_rows, below, on_floor, noise)
-            else:
-                compared = compare_measured(view, profile, below, on_floor, NOISE_PX)
+            heights = self._heights(view, profile, pair, below)
+            compared = _compared(view, profile, pair, below, heights)
         with measure('evidence'):
-            left_view = left[columns]
-            evidence = _evidence(
-                view,
-                below,
-                left_view,
-                texture,
-                enough,
-                compared,
-                heights,
-                self._settings.step_height_m,
-            )
-            clear_hidden(evidence.mask, moving, columns)
-            below_said = None if said is None else said[columns]
-            if below_said is not None:
-                evidence.mask[below_said == NOT_FLOOR] = NOT_FLOOR
+            evidence = _evidence(view, pair, below, compared, heights, self._settings.step_height_m)
         with measure('filling'):
-            mask = self._fill(
-                view, profile, below, evidence, left_rows, textured, compared, below_said
-            )
+            mask = self._fill(view, profile, pair, below, evidence, compared)
         with measure('likelihood'):
-            pixels = self._seen(
-                view, below, texture / enough, left_rows, heights, compared, noise, mask
-            )
-            mask = drop_islands(weighed(mask, self.likelihood.of(pixels), pixels))
-            if not (is_fixed or is_proved):
+            seen = _seen(view, pair, below, compared, heights, mask)
+            mask = drop_islands(weighed(mask, self.likelihood.of(seen), seen))
+            if not is_shown:
                 mask[mask == FLOOR] = NO_EVIDENCE
-            clear_hidden(mask, moving, columns)
+            mask = pair.without_hidden(mask)
         with measure(DISPARITY_ABOVE):
-            hanging_xy = self._overhead.positions(
-                left, right, view.mount, first_row, enough, moving, measured
-            )
+            hanging_xy = self._hanging(view, pair)
         with measure('scan'):
-            feet_xy = _feet(view, profile, mask, row_slope(left_view), textured)
-            if below_said is not None:
-                feet_xy = np.hstack([feet_xy, _barriers(view, profile, below_said)])
+            feet_xy = _feet(view, profile, pair, mask)
             movable_xy = None if movable is None else self._positions(view, movable)
             scan = self._scan(view, profile, below, evidence, mask, hanging_xy, feet_xy, movable_xy)
         if movable is not None:
@@ -234,38 +174,73 @@ class FloorSegmentation:
         said = ('fixture', self.fixture.problem), ('network', self.network.remark)
         return {about: words for about, words in said if words}
 
+    def _expected(self, mount: Mount, T_map_base: Array | None) -> Array:
+        expected = expectations(mount, T_map_base)
+        return np.vstack([expected, self.fixture.usual(expected[0])])
+
+    def _part(self, mount: Mount, expected: Array) -> tuple[slice, slice]:
+        """Return the rows and columns of the image that are looked at."""
+        mounts = (_with_angles(mount, one) for one in expected)
+        first_row = min(first_floor_row(self._camera, one) for one in mounts)
+        return np.s_[first_row:, :: column_step(self._camera)]
+
+    def _hidden(
+        self,
+        left: NDArray[np.uint8],
+        moving: NDArray[np.uint8] | None,
+        said: NDArray[np.uint8] | None,
+    ) -> NDArray[np.uint8] | None:
+        """Return the mask (H, W) of what does not count: the border, and what moves."""
+        hidden = union(moving, self._border.see(left))
+        if said is None:
+            return hidden
+        return union(hidden, np.where(said == MOVING, np.uint8(255), np.uint8(0)))
+
+    def _disparities(self, pair: Pair) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Return the disparity (H, W) of what counts, and that of what a network says moves."""
+        disparity = self._matched(pair) if pair.measured is None else pair.measured
+        movable = None
+        if pair.said is not None:
+            movable = np.where(pair.said == MOVING, disparity, np.float32(0))
+            disparity[pair.said == NOT_FLOOR] = 0
+        if pair.moving is not None:
+            disparity[pair.moving > 0] = 0
+        return disparity, movable
+
+    def _plane(self, pair: Pair, below: NDArray[np.float32], expected: Array) -> tuple[Array, bool]:
+        """Return pitch, roll and height (3,) of the camera, and whether the floor may be there: of
+        a camera that is not fixed to its base only where the image proves it.
+        """
+        is_fixed = self.fixture.problem is None
+        looked = self._camera, pair.first_row, below, pair.texture, pair.enough, expected
+        fit = plane_of_frame(*looked, is_fixed)
+        is_proved = fit.evidence > PROVED
+        is_lost = is_fixed and not is_proved
+        self.fixture.note(plane_of_frame(*looked, is_fixed=False) if is_lost else fit)
+        return fit.angles_height, is_fixed or is_proved
+
+    def _counted(self, view: FloorView, pair: Pair, below: NDArray[np.float32]) -> VDisparity:
+        clear = pair.texture > 2 * pair.enough
+        return filtered_v_disparity(view, below, clear, self._matcher.num_disparities, BINS_PER_PX)
+
     def _heights(
-        self, view: FloorView, profile: FloorProfile, below: NDArray[np.float32], measured: bool
+        self, view: FloorView, profile: FloorProfile, pair: Pair, below: NDArray[np.float32]
     ) -> Heights:
-        constant = self._camera.disparity_times_depth if measured else None
+        constant = None if pair.measured is None else self._camera.disparity_times_depth
         most = self._matcher.num_disparities
         table = HeightTable.of(view.line, profile, most, self._settings, constant)
         return Heights.of(view, table, below)
 
-    def _seen(
-        self,
-        view: FloorView,
-        below: NDArray[np.float32],
-        texture: NDArray[np.float32],
-        left_rows: NDArray[np.uint8],
-        heights: Heights,
-        compared: Comparison,
-        noise: float,
-        mask: NDArray[np.uint8],
-    ) -> Seen:
-        part = np.s_[::STEP_PX, :: STEP_PX // view.step]
-        grey = cv2.blur(left_rows, (5, 5))[::STEP_PX, ::STEP_PX].astype(np.float32)
-        return Seen(
-            first_row=view.first_row,
-            floor_px=compared.floor_px,
-            disparity_px=below[part],
-            slope=view.line.slope,
-            texture=texture[part],
-            lower=(heights.off & ~heights.above)[part],
-            grey=grey,
-            costs=compared.costs,
-            noise_grey=noise,
-            is_floor=mask[part] == FLOOR,
+    def _hanging(self, view: FloorView, pair: Pair) -> NDArray[np.float32]:
+        """Return what is in the way above the horizon, (2, N) in the base's x-y plane."""
+        return self._overhead.positions(
+            pair.left,
+            pair.right,
+            view.mount,
+            pair.first_row,
+            pair.enough,
+            pair.moving,
+            pair.measured,
         )
 
     def _observation(
@@ -309,37 +284,33 @@ class FloorSegmentation:
         self._overhead = OverheadMatcher(self._camera, searched, self._settings)
         self._scanner = FloorScanner(self._camera, mount, self._settings)
 
-    def _disparity(
-        self, first_row: int, left: NDArray[np.uint8], right: NDArray[np.uint8]
-    ) -> NDArray[np.float32]:
+    def _matched(self, pair: Pair) -> NDArray[np.float32]:
         settings, camera = self._settings, self._camera
-        top = 0 if settings.disparity_above_horizon else first_row
+        top = 0 if settings.disparity_above_horizon else pair.first_row
         assert self._mount is not None
         fine_rows = last_fine_row(camera, self._mount) - top
-        disparity = np.zeros(left.shape, np.float32)
-        disparity[top:] = self._matcher.compute(left[top:], right[top:], fine_rows)
+        disparity = np.zeros(pair.left.shape, np.float32)
+        disparity[top:] = self._matcher.compute(pair.left[top:], pair.right[top:], fine_rows)
         return disparity
 
     def _fill(
         self,
         view: FloorView,
         profile: FloorProfile,
+        pair: Pair,
         disparity: NDArray[np.float32],
         evidence: Evidence,
-        left_rows: NDArray[np.uint8],
-        textured: NDArray[np.bool_],
         compared: Comparison,
-        said: NDArray[np.uint8] | None,
     ) -> NDArray[np.uint8]:
         """Return the mask with floor where this pair of images alone cannot tell: where it looks
         like floor. The more floor is known the better is known how it looks, so this is done twice,
         and what then does not look like it is floor only if it was measured. Nor does it contradict
         a network that was right so far.
         """
-        mask, odd = evidence.mask, evidence.odd
+        mask, odd, said, textured = evidence.mask, evidence.odd, pair.said_there, pair.textured
         beside = beside_something(view, mask)
-        left = np.ascontiguousarray(left_rows[:, :: view.step])
-        slope = image_slope(left_rows)
+        left = np.ascontiguousarray(pair.left[pair.part])
+        slope = image_slope(pair.left_rows)
         upright_px = upright_above(view, disparity, compared, textured)
         for _ in range(2):
             mask = fill_regions(
@@ -396,41 +367,79 @@ class FloorSegmentation:
         return self._overhead.in_the_way(uv_px.astype(float), at.astype(float), view.mount)
 
 
+def _compared(
+    view: FloorView, profile: FloorProfile, pair: Pair, below: NDArray[np.float32], heights: Heights
+) -> Comparison:
+    on_floor = lies_on_floor(view, below, heights)
+    if pair.measured is not None:
+        return compare_measured(view, profile, below, on_floor, NOISE_PX)
+    images = pair.left_rows, pair.right_rows
+    return compare(view, profile, *images, below, on_floor, pair.noise_grey)
+
+
 def _evidence(
     view: FloorView,
+    pair: Pair,
     below: NDArray[np.float32],
-    left: NDArray[np.uint8],
-    texture: NDArray[np.float32],
-    enough: float,
     compared: Comparison,
     heights: Heights,
     step_m: float,
 ) -> Evidence:
     """Return what the pixels (R, W) of the view say by themselves, cut back to edges, and left
-    open where they do not look like floor and are not measured to lie on it.
+    open where they do not look like floor and are not measured to lie on it; and what a network
+    says stands there.
     """
-    mask = judge(view, below, texture > enough, compared, heights, step_m)
-    seen = trim_to_edges(mask, row_slope(left), TEXTURE_WINDOW_PX // 2 + 3)
+    mask = judge(view, below, pair.textured, compared, heights, step_m)
+    seen = trim_to_edges(mask, pair.slope, TEXTURE_WINDOW_PX // 2 + 3)
+    left = pair.left[pair.part]
     odd, sigmas = unlike_floor(left, seen == FLOOR), mean_height(heights)
     off, standing = np.abs(sigmas) > SIGMAS * MEAN_NOISE, sigmas > SIGMAS
     doubtful = (seen == FLOOR) & odd
     seen[doubtful] = NO_EVIDENCE
     seen[doubtful & ~off & below_floor(seen)] = FLOOR
-    above = (heights.height > 0) & (texture >= _LEAST_SHARE * enough)
+    above = (heights.height > 0) & (pair.texture >= _LEAST_SHARE * pair.enough)
+    seen = pair.without_hidden(seen)
+    if pair.said_there is not None:
+        seen[pair.said_there == NOT_FLOOR] = NOT_FLOOR
     return Evidence(seen, above, off, standing, odd)
 
 
-def _feet(
+def _seen(
     view: FloorView,
-    profile: FloorProfile,
+    pair: Pair,
+    below: NDArray[np.float32],
+    compared: Comparison,
+    heights: Heights,
     mask: NDArray[np.uint8],
-    slope: NDArray[np.int16],
-    textured: NDArray[np.bool_],
+) -> Seen:
+    part = np.s_[::STEP_PX, :: STEP_PX // view.step]
+    grey = cv2.blur(pair.left_rows, (BLOCK_PX, BLOCK_PX))[::STEP_PX, ::STEP_PX]
+    return Seen(
+        first_row=view.first_row,
+        floor_px=compared.floor_px,
+        disparity_px=below[part],
+        slope=view.line.slope,
+        texture=(pair.texture / pair.enough)[part],
+        lower=(heights.off & ~heights.above)[part],
+        grey=grey.astype(np.float32),
+        costs=compared.costs,
+        noise_grey=pair.noise_grey,
+        is_floor=mask[part] == FLOOR,
+    )
+
+
+def _feet(
+    view: FloorView, profile: FloorProfile, pair: Pair, mask: NDArray[np.uint8]
 ) -> NDArray[np.float32]:
-    """Return where blank faces stand, (2, N) in the base's x-y plane."""
-    rows, columns = blank_feet(view, mask, slope, textured)
+    """Return where blank faces stand, and what a network says stands, (2, N) in the base's x-y
+    plane.
+    """
+    rows, columns = blank_feet(view, mask, pair.slope, pair.textured)
     derolled = rows + view.shear_px[columns] + view.first_row
-    return view.positions(rows, columns, profile.at_rows(derolled).astype(np.float32))
+    blank_xy = view.positions(rows, columns, profile.at_rows(derolled).astype(np.float32))
+    if pair.said_there is None:
+        return blank_xy
+    return np.hstack([blank_xy, _barriers(view, profile, pair.said_there)])
 
 
 def _barriers(
@@ -451,11 +460,3 @@ def _barriers(
 def _with_angles(mount: Mount, angles_height: Array) -> Mount:
     pitch, roll, height = (float(value) for value in angles_height)
     return dataclasses.replace(mount, height_m=height, pitch_rad=pitch, roll_rad=roll)
-
-
-def clear_hidden(
-    mask: NDArray[np.uint8], hidden: NDArray[np.uint8] | None, columns: tuple[slice, slice]
-) -> None:
-    """Set a mask of the view to no evidence where the left image shows nothing that counts."""
-    if hidden is not None:
-        mask[hidden[columns] > 0] = NO_EVIDENCE

@@ -26,7 +26,7 @@ from segfloor_ros.core.floor.disparity.profile import (
     pixels_where,
     surface_above,
 )
-from segfloor_ros.core.floor.mask.likelihood import enlarged, with_floor, without_floor
+from segfloor_ros.core.floor.mask.painting import enlarged, with_floor, without_floor
 from segfloor_ros.core.floor.mask.pixel_evidence import EDGE_SLOPE, Comparison, below_floor
 
 _MIN_REGION_PX = 15

@@ -2,7 +2,8 @@
 
 A feature is a physical quantity over what it errs by, so that its weight holds for all cameras. The
 weights are those of a logistic regression on pixels whose truth is known, as many of floor as of
-anything else, whole recordings held out: `tools/fit_floor.py` makes them.
+anything else: `tools/fit_floor.py` makes them, and shows how well weights do that have not seen a
+recording.
 
 What a pixel shows by itself is passed on along the image, as far as that looks alike: a pixel that
 says little is as likely floor as those around it. Gastal and Oliveira, Domain Transform for
@@ -16,16 +17,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE
 from segfloor_ros.core.floor.disparity.matching import NOISE_PX, NOISE_SLOPE, SAME_PX, SIGMAS
 from segfloor_ros.core.floor.disparity.profile import STEP_PX
 from segfloor_ros.core.floor.mask.look import sigmas_off_floor
+from segfloor_ros.core.floor.mask.painting import enlarged, with_floor, without_floor
+from segfloor_ros.core.floor.mask.pixel_evidence import LEAST_FLOOR_PX, Costs
 from segfloor_ros.core.geometry import Array
 
 Picture = NDArray[np.float32]
@@ -50,21 +51,21 @@ disparity. look: log ratio of how likely its brightness is of the floor to how o
 
 _IN_ORDER = tuple(WEIGHTS.values())
 PASSED_ON = 0.12, 0.89, 1.35
-"""What a pixel has of itself, and of what is passed on to it: a constant, and weights."""
+"""A constant, the weight of what a pixel says by itself, and that of what is passed on to it."""
 
 _SURE, _LIKELY, _UNLIKELY = (math.log(p / (1 - p)) for p in (0.95, 0.75, 0.4))
 """Log odds: what is more likely floor than the first is floor, if it is by itself more likely than
 the second; what is by itself less likely than the third is none."""
-LEAST_FLOOR_PX = 2.5
-"""Farther floor, of smaller disparity, is not judged."""
-
 _LOCAL, _ROUNDS = (31, 15), 3
 """Columns and rows of the window in which the floor around a pixel is measured, and how often."""
 _NOTHING = 0.02
 """So small a share of a window tells nothing."""
 LEAST_KNOWN = 0.2
+"""What is known less well than this share says nothing."""
 _LEAST_PIXELS = 100
+"""Fewer do not tell how they spread."""
 _NEAR, _WIDE = (5, 5), (9, 9)
+"""Columns and rows of the windows over which pixels are averaged, and are counted."""
 _MOST_SIGMAS, _MOST_NATS = 12.0, 6.0
 """No feature says more: what is wrong is then as wrong as it can be."""
 _UNEVEN = 0.7, 2.8
@@ -90,25 +91,14 @@ _EDGES = 2.0
 
 
 @dataclass(frozen=True)
-class Costs:
-    """How much both images differ around each pixel, grey levels: were it floor, and as matched.
-    reached: 1 where the right camera sees the floor, else 0.
-    """
-
-    floor: Picture
-    matched: Picture
-    reached: Picture
-
-
-@dataclass(frozen=True)
 class Seen:
     """What is known of each pixel.
 
     first_row: of the image. floor_px, disparity_px: disparity of the floor, and the matched one, 0
     where none is. slope: of a floor's disparity, per row of the image. texture: as many times of
     what is surely no noise. lower: bool, what lies deeper than a robot may drop. grey: brightness,
-    smoothed.
-    costs: None of a depth camera. noise_grey: of the images. is_floor: bool, what is floor so far.
+    smoothed. costs: None of a depth camera. noise_grey: of the images. is_floor: bool, what is
+    floor so far.
     """
 
     first_row: int
@@ -284,7 +274,7 @@ def _along(values: Picture, kept: Picture) -> Picture:
 @dataclass(frozen=True)
 class Likely:
     """Log-likelihood ratios of floor: of each pixel by itself, and with what is around it.
-    measured: where the disparities around it say anything.
+    measured: where its disparity says anything.
     """
 
     alone: Picture
@@ -330,23 +320,3 @@ def weighed(mask: NDArray[np.uint8], likely: Likely, seen: Seen) -> NDArray[np.u
     unlikely = judged & (likely.alone < _UNLIKELY) & (likely.together < 0)
     sure = judged & ~seen.lower & (likely.alone > _LIKELY) & (likely.together > _SURE)
     return with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))
-
-
-def with_floor(mask: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Return the mask (R, W) with floor where nothing is known and `where` (R, W) is set."""
-    return _changed(mask, (mask == NO_EVIDENCE) & where)
-
-
-def without_floor(mask: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Return the mask (R, W) with nothing known where it is floor and `where` (R, W) is set."""
-    return _changed(mask, (mask == FLOOR) & where)
-
-
-def _changed(mask: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    return mask ^ (where.view(np.uint8) * np.uint8(NO_EVIDENCE ^ FLOOR))
-
-
-def enlarged(picture: NDArray[np.bool_], like: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return a picture of half the resolution (h, w) in the size of another (R, W)."""
-    size = (like.shape[1], like.shape[0])
-    return cv2.resize(picture.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0

@@ -29,9 +29,11 @@ from segfloor_ros.core.floor.disparity.matching import (
     SIGMAS,
 )
 from segfloor_ros.core.floor.disparity.profile import STEP_PX, FloorLine, FloorProfile, FloorView
-from segfloor_ros.core.floor.mask.likelihood import LEAST_FLOOR_PX, Costs, enlarged
+from segfloor_ros.core.floor.mask.painting import enlarged
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
+LEAST_FLOOR_PX = 2.5
+"""Farther floor, of smaller disparity, is not judged."""
 _CONTACT_HEIGHT_M = 0.12
 """Up to this height an upright surface is taken to stand on the floor below it."""
 
@@ -68,12 +70,24 @@ EDGE_SLOPE = 24
 
 
 @dataclass(frozen=True)
+class Costs:
+    """How much both images differ around each pixel, grey levels: were it floor, and as matched,
+    (R / 2, W'). reached: 1 where the right camera sees the floor, else 0.
+    """
+
+    floor: NDArray[np.float32]
+    matched: NDArray[np.float32]
+    reached: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
 class Comparison:
     """What the images say of each pixel of a view, (R, W) bool where not said otherwise.
 
     floor_px: (R / 2, W') float32, the floor's disparity at half the resolution of the image.
     against: clearly more like the matched disparity than like floor. denied: the same of the
     surroundings taken together. unlike: unlike floor, whatever it is. consistent: may be floor.
+    costs: None of a depth camera.
     """
 
     floor_px: NDArray[np.float32]

@@ -10,7 +10,6 @@ import pytest
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.floor.mask.likelihood import (
     WEIGHTS,
-    Costs,
     Likelihood,
     Likely,
     Seen,
@@ -19,6 +18,7 @@ from segfloor_ros.core.floor.mask.likelihood import (
     passed_on,
     weighed,
 )
+from segfloor_ros.core.floor.mask.pixel_evidence import Costs
 
 SHAPE, SLOPE = (120, 200), 0.15
 ROWS, COLUMNS = np.indices(SHAPE, np.float32)
