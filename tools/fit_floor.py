@@ -10,7 +10,7 @@ drive, and without its family of scenes, tell its floor.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Optional
@@ -30,12 +30,9 @@ from segfloor_ros.core.floor.mask.likelihood import (
     LEAST_KNOWN,
     WEIGHTS,
     Likelihood,
-    Likely,
-    Picture,
     Seen,
     features,
     known_weight,
-    passed_on,
 )
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.geometry import Array
@@ -56,10 +53,10 @@ class Recorder(Likelihood):
 
     seen: Seen
 
-    def of(self, seen: Seen) -> Likely:
-        """Return how likely the pixels of a frame are floor."""
+    def weighed(self, mask: NDArray[np.uint8], seen: Seen) -> NDArray[np.uint8]:
+        """Return a mask (R, W) corrected."""
         self.seen = seen
-        return super().of(seen)
+        return super().weighed(mask, seen)
 
 
 @dataclass(frozen=True)
@@ -96,34 +93,8 @@ class Pixels:
         return found
 
 
-@dataclass(frozen=True)
-class Frame:
-    """A scored frame: features (F, h, w), what was seen, and which pixels (N,) of it count, by
-    index, floor or not.
-    """
-
-    parts: Picture
-    seen: Seen
-    at: NDArray[np.intp]
-    is_floor: NDArray[np.bool_]
-
-    def pixels(self, pictures: Picture) -> Pixels:
-        """Return the values of those pixels in pictures (F, h, w)."""
-        values = pictures.reshape(len(pictures), -1)[:, self.at].T.astype(np.float64)
-        return Pixels(values, self.is_floor, np.ones(len(self.at))).weighing(1.0)
-
-    def combined(self, weights: Array) -> Pixels:
-        """Return of those pixels one, what each says alone, and what is around it."""
-        alone = Likelihood(weights).alone(self.parts)
-        alone = np.where(self.seen.floor_px > SAME_PX, alone, alone.min())
-        around = passed_on(alone, self.seen.grey, self.seen.noise_grey)
-        return self.pixels(np.stack([np.ones_like(alone), alone, around]))
-
-
-def scored_frames(
-    drive: FloorDrive, configuration: Configuration, rng: np.random.Generator
-) -> list[Frame]:
-    """Return the scored frames of a drive, with pixels that are drawn by chance."""
+def pixels_of(drive: FloorDrive, configuration: Configuration, rng: np.random.Generator) -> Pixels:
+    """Return pixels of the scored frames of a drive that are measured, drawn by chance."""
     stage = FloorSegmentation(drive.camera, configuration.floor_segmentation)
     stage.likelihood = recorder = Recorder()
     found = []
@@ -132,32 +103,24 @@ def scored_frames(
             continue
         seen = recorder.seen
         part = np.s_[seen.first_row :: STEP_PX, ::STEP_PX]
-        label = frame.truth.label[part]
-        weight = known_weight(seen)
-        counts = (label != UNKNOWN) & (seen.floor_px > SAME_PX) & (weight > LEAST_KNOWN)
+        label, known = frame.truth.label[part], known_weight(seen)
+        counts = (label != UNKNOWN) & (seen.floor_px > SAME_PX) & (known > LEAST_KNOWN)
         if frame.moving is not None:
             counts &= frame.moving[part] == 0
-        drawn = [np.flatnonzero(counts & ((label == TRUE_FLOOR) == kind)) for kind in (True, False)]
-        drawn = [rng.choice(at, min(PIXELS, len(at)), replace=False) for at in drawn if len(at)]
-        if not drawn:
-            continue
-        at = np.concatenate(drawn)
-        found.append(Frame(features(seen, weight), seen, at, label.ravel()[at] == TRUE_FLOOR))
-    return found
+        parts = features(seen, known)
+        for kind in (True, False):
+            at = np.flatnonzero(counts & ((label == TRUE_FLOOR) == kind))
+            at = rng.choice(at, min(PIXELS, len(at)), replace=False) if len(at) else at
+            values = parts.reshape(len(parts), -1)[:, at].T.astype(np.float64)
+            weight = np.full(len(at), 1 / max(len(at), 1))
+            found.append(Pixels(values, np.full(len(at), kind), weight))
+    return Pixels.joined(found)
 
 
-def fitted(drives: dict[str, list[Frame]], outlined: set[str]) -> Likelihood:
-    """Return the likelihood that fits the frames of drives; outlined: by hand, by name."""
-
-    def joined(pixels_of: Callable[[Frame], Pixels]) -> Pixels:
-        parts = []
-        for name, frames in drives.items():
-            one = Pixels.joined([pixels_of(frame) for frame in frames])
-            parts.append(one.weighing(REAL if name in outlined else 1.0))
-        return Pixels.joined(parts)
-
-    weights = joined(lambda frame: frame.pixels(frame.parts)).fitted()
-    return Likelihood(weights, joined(lambda frame: frame.combined(weights)).fitted())
+def fitted(drives: dict[str, Pixels], outlined: set[str]) -> Likelihood:
+    """Return the likelihood that fits the pixels of drives; outlined: by hand, by name."""
+    parts = [one.weighing(REAL if name in outlined else 1.0) for name, one in drives.items()]
+    return Likelihood(Pixels.joined(parts).fitted())
 
 
 def fit_floor(
@@ -184,17 +147,16 @@ def fit_floor(
         drives = {
             one.name: floor_drive(one, cache.expanduser(), False, announce) for one in benches
         }
-    frames = {name: scored_frames(drive, configuration, rng) for name, drive in drives.items()}
-    of_all = fitted(frames, outlined)
+    pixels = {name: pixels_of(drive, configuration, rng) for name, drive in drives.items()}
+    of_all = fitted(pixels, outlined)
     for name, weight in zip(WEIGHTS, of_all.weights, strict=True):
         console.print(f"    '{name}': {weight:.2f},", highlight=False)
-    console.print('PASSED_ON = ' + ', '.join(f'{w:.2f}' for w in of_all.combined), highlight=False)
     if not held_out:
         return
     rows = []
     for bench in benches:
         alike = {one.name for one in benches if one.group == bench.group} - outlined
-        others = {n: f for n, f in frames.items() if n != bench.name and n not in alike}
+        others = {n: p for n, p in pixels.items() if n != bench.name and n not in alike}
         likelihood = fitted(others, outlined)
         _, row = segment(bench, drives[bench.name], configuration, likelihood)
         rows.append(row)

@@ -204,7 +204,9 @@ FLOOR: dict[str, Mechanism] = {
     'most of what is measured around': Mechanism(
         {'core.floor.mask.pixel_evidence.most_around': lambda said, _: ~_nowhere(said)}
     ),
-    'likelihood of floor': Mechanism({'core.floor.segmentation.weighed': lambda mask, *_: mask}),
+    'likelihood of floor': Mechanism(
+        {'core.floor.segmentation.Likelihood.weighed': lambda self, mask, seen: mask}
+    ),
     'what stands beside the left border': Mechanism(
         {'core.floor.segmentation.beside_something': lambda view, mask: _nowhere(mask)}
     ),

@@ -55,7 +55,7 @@ from segfloor_ros.core.floor.mask.filling import (
     trim_to_edges,
     upright_above,
 )
-from segfloor_ros.core.floor.mask.likelihood import Likelihood, Seen, weighed
+from segfloor_ros.core.floor.mask.likelihood import Likelihood, Seen
 from segfloor_ros.core.floor.mask.look import unlike_floor
 from segfloor_ros.core.floor.mask.painting import with_floor, without_floor
 from segfloor_ros.core.floor.mask.pixel_evidence import (
@@ -132,7 +132,8 @@ class FloorSegmentation:
         """
         measure = self._times.measure
         self._prepare(mount)
-        expected = self._expected(mount, T_map_base)
+        expected = expectations(mount, T_map_base)
+        expected = np.vstack([expected, self.fixture.usual(expected[0])])
         with measure('texture'):
             part = self._part(mount, expected)
             pair = Pair.of(left, right, self._hidden(left, moving, said), said, part)
@@ -154,7 +155,7 @@ class FloorSegmentation:
             mask = self._fill(view, profile, pair, below, evidence, compared)
         with measure('likelihood'):
             seen = _seen(view, pair, below, compared, heights, mask)
-            mask = drop_islands(weighed(mask, self.likelihood.of(seen), seen))
+            mask = drop_islands(self.likelihood.weighed(mask, seen))
             if not is_shown:
                 mask[mask == FLOOR] = NO_EVIDENCE
             mask = pair.without_hidden(mask)
@@ -174,14 +175,9 @@ class FloorSegmentation:
         said = ('fixture', self.fixture.problem), ('network', self.network.remark)
         return {about: words for about, words in said if words}
 
-    def _expected(self, mount: Mount, T_map_base: Array | None) -> Array:
-        expected = expectations(mount, T_map_base)
-        return np.vstack([expected, self.fixture.usual(expected[0])])
-
     def _part(self, mount: Mount, expected: Array) -> tuple[slice, slice]:
         """Return the rows and columns of the image that are looked at."""
-        mounts = (_with_angles(mount, one) for one in expected)
-        first_row = min(first_floor_row(self._camera, one) for one in mounts)
+        first_row = min(first_floor_row(self._camera, _with_angles(mount, one)) for one in expected)
         return np.s_[first_row:, :: column_step(self._camera)]
 
     def _hidden(
@@ -233,15 +229,8 @@ class FloorSegmentation:
 
     def _hanging(self, view: FloorView, pair: Pair) -> NDArray[np.float32]:
         """Return what is in the way above the horizon, (2, N) in the base's x-y plane."""
-        return self._overhead.positions(
-            pair.left,
-            pair.right,
-            view.mount,
-            pair.first_row,
-            pair.enough,
-            pair.moving,
-            pair.measured,
-        )
+        given = pair.first_row, pair.enough, pair.moving, pair.measured
+        return self._overhead.positions(pair.left, pair.right, view.mount, *given)
 
     def _observation(
         self,
@@ -373,8 +362,7 @@ def _compared(
     on_floor = lies_on_floor(view, below, heights)
     if pair.measured is not None:
         return compare_measured(view, profile, below, on_floor, NOISE_PX)
-    images = pair.left_rows, pair.right_rows
-    return compare(view, profile, *images, below, on_floor, pair.noise_grey)
+    return compare(view, profile, pair.left_rows, pair.right_rows, below, on_floor, pair.noise_grey)
 
 
 def _evidence(

@@ -5,10 +5,6 @@ weights are those of a logistic regression on pixels whose truth is known, as ma
 anything else: `tools/fit_floor.py` makes them, and shows how well weights do that have not seen a
 recording.
 
-What a pixel shows by itself is passed on along the image, as far as that looks alike: a pixel that
-says little is as likely floor as those around it. Gastal and Oliveira, Domain Transform for
-Edge-Aware Image and Video Processing (2011), the recursive filter.
-
 All pictures here are of half the resolution of the image, (h, w) float32.
 """
 
@@ -50,12 +46,11 @@ disparity. look: log ratio of how likely its brightness is of the floor to how o
 """
 
 _IN_ORDER = tuple(WEIGHTS.values())
-PASSED_ON = 0.12, 0.89, 1.35
-"""A constant, the weight of what a pixel says by itself, and that of what is passed on to it."""
 
-_SURE, _LIKELY, _UNLIKELY = (math.log(p / (1 - p)) for p in (0.95, 0.75, 0.4))
-"""Log odds: what is more likely floor than the first is floor, if it is by itself more likely than
-the second; what is by itself less likely than the third is none."""
+_SURE, _UNLIKELY = (math.log(p / (1 - p)) for p in (0.95, 1 / 3))
+"""Log odds: what is more likely floor than the first is floor, what is less likely than the second
+is none."""
+
 _LOCAL, _ROUNDS = (31, 15), 3
 """Columns and rows of the window in which the floor around a pixel is measured, and how often."""
 _NOTHING = 0.02
@@ -78,16 +73,7 @@ _UNEQUAL_GREY = 0.8, 0.3
 _BINS, _END = 2, 10
 """Of the histogram of brightness, per sigma of the floor's; it ends at so many sigmas."""
 _LOOK_NATS = -4.0, 3.0
-_MOST_ALONE = 8.0
-"""Bounds of what a look says, and of what a pixel says by itself."""
-
-_REACH_PX = 15.0
-"""So far a pixel passes on what it knows, where nothing borders."""
-_DARK_GREY = 8.0
-"""Differences of grey levels count as shares of grey levels this much brighter."""
-_LEAST_EDGE = 0.02
-_EDGES = 2.0
-"""Differences that are larger, in medians of those on the floor, border."""
+"""Bounds of what a look says."""
 
 
 @dataclass(frozen=True)
@@ -235,88 +221,20 @@ def _look(grey: Picture, is_floor: NDArray[np.bool_]) -> Picture:
     return look
 
 
-def passed_on(alone: Picture, grey: Picture, noise_grey: float) -> Picture:
-    """Return what the pixels around each one say of the floor, (h, w), as far as it is unsure.
-    alone: the log-likelihood ratio of each by itself. grey: smoothed.
-    """
-    certain = np.abs(np.tanh(alone / 2))
-    brightness = cv2.log(grey + _DARK_GREY)
-    across, down = (np.abs(np.diff(brightness, axis=axis)) for axis in (1, 0))
-    is_floor = alone > SIGMAS
-    inside = is_floor[:, 1:] & is_floor[:, :-1]
-    usual = 1.4826 * float(np.median(across[inside])) if inside.any() else 0.0
-    noise = 0.15 * noise_grey / (float(np.median(grey)) + _DARK_GREY)
-    edge = np.float32(_EDGES * math.hypot(max(_LEAST_EDGE, usual), noise))
-    said = np.stack([alone * certain, certain]).astype(np.float32)
-    said = _along(said.transpose(2, 0, 1), _kept(across, edge).T)
-    said = _along(said.transpose(2, 1, 0), _kept(down, edge))
-    around = said[:, 0] / (said[:, 1] + np.float32(_NOTHING))
-    unsure: Picture = (1 - certain) * around
-    return unsure
-
-
-def _kept(difference: Picture, edge: np.float32) -> Picture:
-    """Return the share of what a pixel knows that its neighbour gets."""
-    kept: Picture = np.exp(-math.sqrt(2) * (1 / _REACH_PX + np.maximum(difference / edge - 0.5, 0)))
-    return kept.astype(np.float32)
-
-
-def _along(values: Picture, kept: Picture) -> Picture:
-    """Return values (N, 2, m) passed on along the first axis, forth and back. kept: (N - 1, m)."""
-    values, kept = np.ascontiguousarray(values), np.ascontiguousarray(kept)
-    for i in range(1, len(values)):
-        values[i] += kept[i - 1] * (values[i - 1] - values[i])
-    for i in range(len(values) - 2, -1, -1):
-        values[i] += kept[i] * (values[i + 1] - values[i])
-    return values
-
-
-@dataclass(frozen=True)
-class Likely:
-    """Log-likelihood ratios of floor: of each pixel by itself, and with what is around it.
-    measured: where its disparity says anything.
-    """
-
-    alone: Picture
-    together: Picture
-    measured: NDArray[np.bool_]
-
-
 class Likelihood:
-    """Finds how likely the pixels of a frame are floor. weights: of the features, (F,).
-    combined: (3,), as `PASSED_ON`.
-    """
+    """Finds how likely the pixels of a frame are floor. weights: of the features, (F,)."""
 
-    def __init__(
-        self,
-        weights: Sequence[float] | Array = _IN_ORDER,
-        combined: Sequence[float] | Array = PASSED_ON,
-    ) -> None:
+    def __init__(self, weights: Sequence[float] | Array = _IN_ORDER) -> None:
         self.weights = np.array(weights, np.float32)
-        self.combined = np.array(combined, np.float32)
 
-    def of(self, seen: Seen) -> Likely:
-        """Return how likely each pixel is floor; what is about as far as the horizon is not."""
-        weight = known_weight(seen)
-        alone = self.alone(features(seen, weight))
-        alone = np.where(seen.floor_px > SAME_PX, alone, np.float32(-_MOST_ALONE))
-        constant, own, share = self.combined
-        around = passed_on(alone, seen.grey, seen.noise_grey)
-        together = constant + own * alone + share * around
-        return Likely(alone, together, weight > LEAST_KNOWN)
-
-    def alone(self, parts: Picture) -> Picture:
-        """Return the log-likelihood ratio of floor of pixels by their features (F, ...) alone."""
-        ratio: Picture = np.tensordot(self.weights, parts, 1)
-        return np.clip(ratio, -_MOST_ALONE, _MOST_ALONE)
-
-
-def weighed(mask: NDArray[np.uint8], likely: Likely, seen: Seen) -> NDArray[np.uint8]:
-    """Return a mask (R, W) without floor that is not likely, and with what is surely floor, where
-    that is measured. What lies too low for a robot is a drop, or what a floor mirrors, and no floor
-    however it looks.
-    """
-    judged = likely.measured & (seen.floor_px > LEAST_FLOOR_PX)
-    unlikely = judged & (likely.alone < _UNLIKELY) & (likely.together < 0)
-    sure = judged & ~seen.lower & (likely.alone > _LIKELY) & (likely.together > _SURE)
-    return with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))
+    def weighed(self, mask: NDArray[np.uint8], seen: Seen) -> NDArray[np.uint8]:
+        """Return a mask (R, W) without floor that is not likely, and with what surely is floor,
+        where that is measured. What lies too low for a robot is a drop, or what a floor mirrors,
+        and no floor however it looks.
+        """
+        known = known_weight(seen)
+        log_ratio = np.tensordot(self.weights, features(seen, known), 1)
+        judged = (known > LEAST_KNOWN) & (seen.floor_px > LEAST_FLOOR_PX)
+        unlikely = judged & (log_ratio < _UNLIKELY)
+        sure = judged & ~seen.lower & (log_ratio > _SURE)
+        return with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))

@@ -1,4 +1,4 @@
-"""What the features of a pixel say, how it is passed on, and what becomes of a mask."""
+"""What the features of a pixel say, and what becomes of a mask."""
 
 from __future__ import annotations
 
@@ -11,12 +11,9 @@ from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.floor.mask.likelihood import (
     WEIGHTS,
     Likelihood,
-    Likely,
     Seen,
     features,
     known_weight,
-    passed_on,
-    weighed,
 )
 from segfloor_ros.core.floor.mask.pixel_evidence import Costs
 
@@ -66,9 +63,11 @@ def test_a_stone_is_higher_than_the_ground_beside_it_wherever_the_profile_lies()
     beside = np.s_[60:70, 120:160]
     assert parts['above'][beside].mean() < 0.7
     assert parts['on'][beside].mean() > 0.5
-    likely = Likelihood().of(dataclasses.replace(seen, disparity_px=stone_px))
-    assert likely.alone[middle].max() < 0
-    assert likely.alone[beside].mean() > 2
+    mask = np.full(SHAPE, FLOOR, np.uint8)
+    mask[beside] = NO_EVIDENCE
+    weighed = Likelihood().weighed(mask, dataclasses.replace(seen, disparity_px=stone_px))
+    assert np.all(weighed[middle] == NO_EVIDENCE)
+    assert np.mean(weighed[beside] == FLOOR) > 0.9
 
 
 def test_a_hollow_is_no_obstacle() -> None:
@@ -140,48 +139,27 @@ def test_what_is_darker_or_brighter_than_the_floor_does_not_look_like_it() -> No
     assert not few['look'].any()
 
 
-def test_what_is_known_is_passed_on_up_to_an_edge_of_the_image() -> None:
-    alone = np.zeros(SHAPE, np.float32)
-    alone[:, :20] = 5
-    grey = np.full(SHAPE, 100, np.float32)
-    grey[:, 60:] = 150
-    around = passed_on(alone, grey, NOISE_GREY)
-    assert around[60, 25:55].min() > 1
-    assert np.all(np.diff(around[60, 25:59]) <= 1e-5)
-    assert around[60, 62:].max() < 0.2 * around[60, 55]
-    # What is certain by itself takes nothing over.
-    assert np.abs(around[:, :20]).max() < 0.1
-
-
-def test_what_stands_says_so_to_what_is_beside_it_too() -> None:
-    alone = np.zeros(SHAPE, np.float32)
-    alone[:, 100:] = -6
-    around = passed_on(alone, np.full(SHAPE, 100, np.float32), NOISE_GREY)
-    assert around[:, 90:99].max() < -1
-
-
 @pytest.mark.parametrize('size', [SHAPE, (240, 200), (240, 400)])
 def test_a_mask_changes_only_where_something_is_measured(size: tuple[int, int]) -> None:
     """At half the resolution of the mask, or at its own."""
     mask = np.full(size, NO_EVIDENCE, np.uint8)
     mask[: size[0] // 2] = FLOOR
     mask[:, -size[1] // 4 :] = NOT_FLOOR
-    measured = COLUMNS >= 50
-    seen = dataclasses.replace(ground(), floor_px=np.full(SHAPE, 10, np.float32))
-    surely = Likely(np.full(SHAPE, 3, np.float32), np.full(SHAPE, 4, np.float32), measured)
-    unlikely = Likely(-surely.alone, -surely.together, measured)
+    known, floor_px = COLUMNS >= 50, np.full(SHAPE, 10, np.float32)
+    seen = dataclasses.replace(ground(), floor_px=floor_px, disparity_px=floor_px * known)
+    surely, unlikely = (Likelihood([nats, *6 * [0.0]]) for nats in (3.0, -3.0))
     left, between = np.s_[:, : size[1] // 4], np.s_[:, size[1] // 4 : -size[1] // 4]
-    changed = weighed(mask, surely, seen)
+    changed = surely.weighed(mask, seen)
     np.testing.assert_array_equal(changed[left], mask[left])
     assert np.all(changed[between] == FLOOR)
     assert np.all(changed[:, -size[1] // 4 :] == NOT_FLOOR)
-    changed = weighed(mask, unlikely, seen)
+    changed = unlikely.weighed(mask, seen)
     np.testing.assert_array_equal(changed[left], mask[left])
     assert np.all(changed[between] == NO_EVIDENCE)
     assert np.all(changed[:, -size[1] // 4 :] == NOT_FLOOR)
     far = dataclasses.replace(seen, floor_px=np.full(SHAPE, 2, np.float32))
-    np.testing.assert_array_equal(weighed(mask, surely, far), mask)
-    split = Likely(unlikely.alone, surely.together, measured)
-    np.testing.assert_array_equal(weighed(mask, split, seen), mask)
+    np.testing.assert_array_equal(surely.weighed(mask, far), mask)
+    unsure = Likelihood([0.5, *6 * [0.0]])
+    np.testing.assert_array_equal(unsure.weighed(mask, seen), mask)
     drop = dataclasses.replace(seen, lower=np.ones(SHAPE, bool))
-    np.testing.assert_array_equal(weighed(mask, surely, drop), mask)
+    np.testing.assert_array_equal(surely.weighed(mask, drop), mask)
