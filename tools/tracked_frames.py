@@ -87,7 +87,7 @@ def track_frames(
         for step in drive(slam, after_sensors(slam, sensors, frames), on_progress):
             note(step.results)
         if slam.mount is None:
-            slam.rig.mount = CAMERA_AS_BASE
+            slam.rig.base = CAMERA_AS_BASE
         note(slam.finish())
     assert slam.mount is not None
     began_ns = path.stamp_ns[0] if len(path.stamp_ns) else 0

@@ -207,7 +207,7 @@ class Pipeline:
         not known.
         """
         if self.mount is None:
-            self.path_only, self.slam.rig.mount = True, CAMERA_AS_BASE
+            self.path_only, self.slam.rig.base = True, CAMERA_AS_BASE
         results = self.slam.finish()
         self._take_in(results)
         return results

@@ -30,8 +30,11 @@ def make_slam(
 ) -> StereoSlam:
     """Build stereo SLAM with the camera's mount: `mount` when it is known (from tf), else from
     the settings, and whatever the settings leave open is measured from the floor the camera
-    sees. background: adjust the map beside tracking.
+    sees. CAMERA_AS_BASE: it is measured, too, and tracking is the same, but results wait for none
+    and have the axes of the camera. background: adjust the map beside tracking.
     """
+    base = mount if mount is CAMERA_AS_BASE else None
+    mount = None if mount is base else mount
     height_m, pitch_rad, roll_rad = (
         settings.camera_height_m,
         settings.camera_pitch_rad,
@@ -51,9 +54,11 @@ def make_slam(
             forward_m=settings.camera_forward_m,
             left_m=settings.camera_left_m,
         )
-    elif mount is not CAMERA_AS_BASE:
+    else:
         meter = MountEstimator(camera, forward_m=mount.forward_m, left_m=mount.left_m, given=mount)
-    return equipped_slam(camera, settings, mount, meter, times, background)
+    slam = equipped_slam(camera, settings, mount, meter, times, background)
+    slam.rig.base = base
+    return slam
 
 
 def equipped_slam(

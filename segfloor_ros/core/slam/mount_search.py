@@ -24,7 +24,7 @@ class MountSearch:
     @property
     def provisional(self) -> Mount | None:
         """The estimate of a mount that is not known yet."""
-        if self._meter is None or self._rig.mount is not None:
+        if self._meter is None or self._rig.base_mount is not None:
             return None
         return self._meter.provisional
 
@@ -58,9 +58,12 @@ class MountSearch:
         self._looked_ns = frame.stamp_ns
         up = self._sensors.up_world
         meter.add(frame.left, frame.right, invert(T_camera_world), up, is_keyframe)
-        if rig.mount is not None and meter.mount != rig.mount:
+        is_new = rig.mount is not None and meter.mount != rig.mount
+        rig.mount, rig.mount_may_change = meter.mount, meter.may_change
+        if rig.base is not None:
+            return
+        if is_new:
             self._held.take_back()
         if meter.remark is not None:
             self._sensors.remark({'mount': meter.remark})
-        rig.mount, rig.mount_may_change = meter.mount, meter.may_change
         self._held.keep(meter.may_change)

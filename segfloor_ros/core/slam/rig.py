@@ -105,15 +105,22 @@ class DisparityOffset:
 @dataclass
 class Rig:
     """What all of SLAM knows of the stereo rig. mount: None until it is measured or given.
-    mount_may_change: whether later looks may show another.
+    mount_may_change: whether later looks may show another. base: where results place the base,
+    None for at the mount; a path alone needs no mount, and waits for none.
     """
 
     camera: StereoCamera
     mount: Mount | None = None
     mount_may_change: bool = False
+    base: Mount | None = None
     offset: DisparityOffset = field(
         default_factory=lambda: DisparityOffset(OFFSET_SIGMA_PX, 1.0 / LOCAL_KEYFRAMES)
     )
+
+    @property
+    def base_mount(self) -> Mount | None:
+        """The mount by which results are returned."""
+        return self.base or self.mount
 
 
 @dataclass(frozen=True)

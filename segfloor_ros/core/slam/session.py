@@ -138,7 +138,7 @@ class MapSession:
         """
         mount = self._mount_search.provisional
         if self.state.holds_results and self.unsure_start is not None:
-            mount = self._map.rig.mount or mount
+            mount = self._map.rig.base_mount or mount
         return None if mount is None else self._held.newest(mount)
 
     @property
@@ -161,7 +161,7 @@ class MapSession:
 
     def take(self, result: FrameResult) -> list[FrameResult]:
         """Take in the result of a frame, and return all results that are ready, oldest first."""
-        return self._held.take(result, self._map.rig.mount)
+        return self._held.take(result, self._map.rig.base_mount)
 
     def find_in_loaded(
         self, frame: StereoFrame, images: Images, fault: str
@@ -247,7 +247,7 @@ class MapSession:
             self._back_end.collect(wait=True)
             if not (may_replace and self._keep_submap()):
                 self._drop()
-        return self._held.release(self._map.rig.mount)
+        return self._held.release(self._map.rig.base_mount)
 
     def to_arrays(self) -> Arrays:
         """Return the map for a file: the known one while results are held back."""

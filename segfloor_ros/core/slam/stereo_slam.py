@@ -132,7 +132,7 @@ class StereoSlam:
     @property
     def mount(self) -> Mount | None:
         """The mount of the camera, None until it is measured."""
-        return self.rig.mount
+        return self.rig.base_mount
 
     @property
     def last_pose(self) -> LastPose | None:
@@ -193,6 +193,7 @@ class StereoSlam:
         """
         self.back_end.from_arrays(arrays)
         self.front_end.is_fixed = localize
+        self.rig.base = None
         self._mount_search.use(mount)
         self.session.load(last)
 
@@ -214,7 +215,8 @@ class StereoSlam:
         self.back_end.collect(wait=False)
         if not self.back_end.holds_one():
             self.late_masks.take_points_back()
-        self.sensors.T_base_left = self.mount.T_base_left if self.mount else None
+        mount = self.rig.mount
+        self.sensors.T_base_left = mount.T_base_left if mount else None
 
     def _prepared(self, frame: StereoFrame, fault: str) -> tuple[StereoFrame, Images]:
         """Return a frame corrected by the check of the rig, and its images."""
@@ -248,7 +250,7 @@ class StereoSlam:
         motion = self.front_end.motion
         with self._times.measure('moving'):
             return self._moving.search(
-                frame, motion.T_camera_world, motion.T_odom_camera, self.mount
+                frame, motion.T_camera_world, motion.T_odom_camera, self.rig.mount
             )
 
     def _add_keyframe(

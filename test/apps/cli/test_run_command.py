@@ -331,6 +331,16 @@ def test_the_path_alone_takes_a_mount_that_is_given(recording, result, tmp_path)
     assert summary['map'] is None and summary['camera_height_m'] == MOUNT.height_m
 
 
+def test_the_path_alone_is_the_path_of_the_map(shared_data, tmp_path):
+    """The mount of this camera is measured, and it changes."""
+    drive, words = shared_data / 'kitchen', ('--frames', 60)
+    for out, more in (tmp_path / 'map', ()), (tmp_path / 'path', ('--no-map',)):
+        done = segfloor('run', drive, '--out', out, *more, *words)
+        assert done.returncode == 0, done.stderr
+    path = (tmp_path / 'path' / 'camera_trajectory.txt').read_bytes()
+    assert path == (tmp_path / 'map' / 'camera_trajectory.txt').read_bytes()
+
+
 def test_a_saved_map_is_localized_in(recording, result, tmp_path):
     saved, first = tmp_path / 'room.map', tmp_path / 'first'
     done = segfloor('run', recording, '--out', first, '--save-map', saved, *with_mount())

@@ -11,8 +11,9 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.contracts import NO_POINT, StereoFrame
 from segfloor_ros.core.geometry import invert, rotation_angle
-from segfloor_ros.core.plugins.assembly import equipped_slam
+from segfloor_ros.core.plugins.assembly import equipped_slam, make_slam
 from segfloor_ros.core.slam.settings import StereoSlamSettings
+from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE
 
 SETTINGS = StereoSlamSettings(num_features=800)
 
@@ -340,6 +341,22 @@ def test_results_wait_for_the_mount_and_none_is_lost(frames):
     assert sizes[first] == first + 1
     assert sizes[first + 1 :] == [1] * (len(frames) - first - 1)
     assert [r.index for batch in batches for r in batch] == list(range(len(frames)))
+
+
+def test_a_path_alone_waits_for_no_mount_and_measures_it_all_the_same(frames):
+    """Places are believed by what the ground shows, too, so the path would differ without it."""
+    with_map, alone = make_slam(CAMERA, SETTINGS), make_slam(CAMERA, SETTINGS, CAMERA_AS_BASE)
+    mapped = [result for frame in frames for result in with_map.process(frame)]
+    batches = [alone.process(frame) for frame in frames]
+    assert [len(batch) for batch in batches] == [1] * len(frames)
+    assert with_map.mount is not None and alone.rig.mount == with_map.mount
+    assert alone.mount is CAMERA_AS_BASE
+    T_base_left = with_map.mount.T_base_left
+    for one, (other,) in zip(mapped, batches, strict=True):
+        T_first_left = invert(T_base_left) @ one.T_map_odom @ one.T_odom_base @ T_base_left
+        T = CAMERA_AS_BASE.T_base_left
+        at_left = invert(T) @ other.T_map_odom @ other.T_odom_base @ T
+        np.testing.assert_allclose(at_left, T_first_left, atol=1e-12)
 
 
 def test_waiting_for_the_mount_does_not_fill_the_memory(frames, monkeypatch):
