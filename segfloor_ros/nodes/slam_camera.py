@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.qos import QoSProfile
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration, eye_calibration
@@ -29,11 +30,13 @@ from segfloor_ros.nodes.messages.diagnostics import LASTS_S, RECENT, Level
 from segfloor_ros.nodes.messages.topics import IMAGES, KEYFRAMES, PATIENCE_S, best_effort
 from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import DISCOVERY_S
-from segfloor_ros.nodes.shared.reporter import offered_best_effort
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 
 CATCH_UP = 0.2
 """Of so many of the pairs kept one is skipped per pair processed, where there is no other way."""
+
+FIRST_INFO_S = 5.0
+"""A driver that starts publishes its calibration by then."""
 
 INFOS = ('left/camera_info', 'right/camera_info')
 
@@ -282,6 +285,7 @@ class CameraWatch:
 
     def __init__(self, node: AnyStageNode) -> None:
         self._node = node
+        self._missing_s: dict[str, float] = {}
 
     def expect(self, left: str, right: str) -> None:
         """Watch these two topics from now on."""
@@ -326,7 +330,11 @@ class CameraWatch:
 
     def find_problems(self, missing_infos: list[str]) -> None:
         """Diagnose what shows over time. missing_infos: calibrations that images wait for."""
+        now_s = time.monotonic()
+        self._missing_s = {topic: self._missing_s.get(topic, now_s) for topic in missing_infos}
         for topic in missing_infos:
+            if now_s - self._missing_s[topic] < FIRST_INFO_S:
+                continue
             self._node.reporter.diagnose(
                 topic,
                 f'no message on {topic}: images wait for their calibration; let the driver '
@@ -408,3 +416,16 @@ class CameraWatch:
                 'both cameras together, or allow more',
                 Level.ERROR,
             )
+
+
+def offered_best_effort(node: Node, topics: Iterable[str]) -> list[str]:
+    """Return the topics that somebody publishes best effort, which reaches no reliable listener."""
+    lossy = ReliabilityPolicy.BEST_EFFORT
+    return [
+        topic
+        for topic in topics
+        if any(
+            info.qos_profile.reliability == lossy
+            for info in node.get_publishers_info_by_topic(topic)
+        )
+    ]

@@ -25,6 +25,7 @@ from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectif
 from segfloor_ros.nodes.messages.diagnostics import HEALTH, Health, Level
 from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.topics import IMAGES, TOPICS, best_effort
+from segfloor_ros.nodes.slam_camera import FIRST_INFO_S
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 CALIBRATION = rectified_calibration(CAMERA)
@@ -162,8 +163,10 @@ def test_images_without_calibration_are_named(make_graph, frames) -> None:
     driver.connect()
     driver.send('left', 0, frames[0].left)
     driver.send('right', 0, frames[0].right, with_info=False)
+    begin_s = time.monotonic()
     status = says(graph, 'stereo_slam', 'no message on right/camera_info', 'segfloor calibrate')
     assert 'left/camera_info' not in status.message
+    assert time.monotonic() - begin_s > 0.9 * FIRST_INFO_S  # it may come a little later
 
 
 def test_images_taken_for_rectified_are_named(make_graph, frames) -> None:

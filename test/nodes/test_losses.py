@@ -19,8 +19,8 @@ from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import HEALTH, LASTS_S, Level
 from segfloor_ros.nodes.messages.images import image_message
-from segfloor_ros.nodes.messages.topics import KEYFRAMES
-from segfloor_ros.nodes.shared.reporter import LossCounter, loss_in_words
+from segfloor_ros.nodes.messages.topics import IMAGES, KEYFRAMES, PROFILES, TOPICS
+from segfloor_ros.nodes.shared.reporter import LossCounter, loss_in_words, loss_level
 from segfloor_ros.nodes.slam_camera import PairQueue
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
@@ -48,6 +48,19 @@ def test_a_loss_is_told_with_what_to_do_about_it() -> None:
     assert 'queue of 100' in words
     lossy = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
     assert 'image_reliability' in loss_in_words('left/image_raw', 1, 'stereo_slam', lossy)
+    for profile in lossy, IMAGES:  # what Fast DDS drops where images are large
+        words = loss_in_words('left/image_raw', 1, 'stereo_slam', profile)
+        assert f'FASTRTPS_DEFAULT_PROFILES_FILE={PROFILES}' in words and PROFILES.exists()
+
+
+def test_how_bad_a_loss_is_follows_from_what_is_lost() -> None:
+    """A calibration comes again, of small images only the latest counts; a picture less is a lower
+    rate; a keyframe that a node misses is never in the map.
+    """
+    levels = {name: loss_level(topic) for name, topic in TOPICS.items()}
+    assert levels['left/camera_info'] is levels['frame/left/image_rect'] is Level.OK
+    assert levels['left/image_raw'] is levels['imu'] is Level.WARN
+    assert levels['keyframe/left/image_rect'] is levels['map_points'] is Level.ERROR
 
 
 def test_a_queue_that_runs_over_is_named_with_its_topic_and_the_node_goes_on(make_graph) -> None:

@@ -15,6 +15,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from sensor_msgs.msg import CameraInfo
 
 from segfloor_ros.core.errors import SegfloorError
 from segfloor_ros.core.memory import rss_mb
@@ -29,7 +30,12 @@ from segfloor_ros.nodes.messages.diagnostics import (
 )
 from segfloor_ros.nodes.messages.topics import (
     DIAGNOSTICS,
+    FRAMES,
+    IMAGES,
+    NAMED_BY,
     PATIENCE_S,
+    PROFILES,
+    SENSORS,
     TOPICS,
     Topic,
     describe_policies,
@@ -65,17 +71,30 @@ class LossCounter:
         return number - last - 1
 
 
+def loss_level(topic: Topic) -> Level:
+    """Return how bad it is to lose a message of a topic: nothing where the next one says the same
+    or only the latest counts, slower than asked where a sensor is missed once, wrong where the map
+    lacks something for good.
+    """
+    if topic.type is CameraInfo or topic.profile is FRAMES:
+        return Level.OK
+    return Level.WARN if topic.profile in (IMAGES, SENSORS) else Level.ERROR
+
+
 def loss_in_words(topic: str, lost: int, node: str, profile: QoSProfile) -> str:
     """Return what was lost, why, and what to do about it."""
+    slower = 'lower the rate or the size of the images'
+    if 'image' in topic:
+        slower = f'start the driver with {NAMED_BY}={PROFILES}, or {slower}'
     if profile.reliability == ReliabilityPolicy.BEST_EFFORT:
         return (
             f'{lost} messages lost on {topic}, which is taken best effort; set image_reliability '
-            'to reliable where the driver offers it, or lower the rate or the size of the images'
+            f'to reliable where the driver offers it, {slower}'
         )
     return (
         f'{lost} messages lost on {topic}: {node} was too slow for its queue of {profile.depth}, '
-        'or the link is; lower the rate or the size of the images, let stereo_slam make fewer '
-        'keyframes, or play a recording with lossless set on stereo_camera'
+        f'or the link is; {slower}, let stereo_slam make fewer keyframes, or play a recording with '
+        'lossless set on stereo_camera'
     )
 
 
@@ -110,9 +129,11 @@ class Reporter:
         # The numbers of several publishers run side by side.
         if lost and subscription.get_publisher_count() == 1:
             self.health.lost(topic.name, lost)
+            if loss_level(topic) is Level.OK:
+                return
             name, profile = self._node.get_name(), subscription.qos_profile
             text = loss_in_words(topic.name, lost, name, profile)
-            self.diagnose(f'loss on {topic.name}', text, Level.ERROR, PATIENCE_S)
+            self.diagnose(f'loss on {topic.name}', text, loss_level(topic), PATIENCE_S)
 
     def note_opened(self) -> None:
         """Note that messages are received from now on; what came before is not missed."""
@@ -215,19 +236,6 @@ def one_line(error: Exception) -> str:
     """Return an error in one line; unexpected ones with their type."""
     text = ' '.join(str(error).split())
     return text if isinstance(error, SegfloorError) else f'{type(error).__name__}: {text}'
-
-
-def offered_best_effort(node: Node, topics: Iterable[str]) -> list[str]:
-    """Return the topics that somebody publishes best effort, which reaches no reliable listener."""
-    lossy = ReliabilityPolicy.BEST_EFFORT
-    return [
-        topic
-        for topic in topics
-        if any(
-            info.qos_profile.reliability == lossy
-            for info in node.get_publishers_info_by_topic(topic)
-        )
-    ]
 
 
 def incompatible_topics(

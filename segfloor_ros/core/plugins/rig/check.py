@@ -47,6 +47,10 @@ SETTLED_FRAMES = EVERY * RECENT
 BURST = 2 + EVERY // 2
 """Frames after a jump: one before the look, the look, and those up to the next view of a turn."""
 
+SKIPPED, USUAL = 1.5, 0.2
+"""Frames are missing before one that comes after so many times the usual time, below which one step
+in five stays."""
+
 FEATURES, LEVELS = 500, 2
 REACH_SHARE = 0.4, 0.15
 """Of width and height: a point is no further from its place in the other eye."""
@@ -173,6 +177,8 @@ class RigCheck:
         self._images = InputFault.images
         self._moving_looks = self._watched = 0
         self._has_gap = False
+        self._last_ns = 0
+        self._steps_ns: deque[int] = deque(maxlen=SETTLED_FRAMES)
         self._depth = DepthCheck()
         self._calibration = CalibrationCheck(camera)
 
@@ -182,6 +188,9 @@ class RigCheck:
         fifty frames, and turns until the calibration is known. turn_rad: since the frame before.
         """
         self._watched += 1
+        if self._is_after_gap(frame.stamp_ns):
+            self._before = None
+            self._calibration.reset_view()
         is_seen = self._moving_looks >= RECENT or self._depth.is_done
         is_settled = is_seen and not self.faults
         is_turn = turn_rad * (EVERY // 2) > MIN_TURN_RAD and not self._calibration.is_done
@@ -192,6 +201,12 @@ class RigCheck:
             self.jump()
         self._has_gap = False
         self.see(frame)
+
+    def _is_after_gap(self, stamp_ns: int) -> bool:
+        """Whether frames are missing before one: the motion between the two is not small."""
+        step_ns, self._last_ns = stamp_ns - self._last_ns, stamp_ns
+        self._steps_ns.append(step_ns)
+        return bool(step_ns > SKIPPED * np.quantile(self._steps_ns, USUAL))
 
     def see(self, frame: StereoFrame) -> None:
         """Take in a frame that shows something."""

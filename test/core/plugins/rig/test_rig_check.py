@@ -184,6 +184,14 @@ def test_a_wrong_focal_length_shows_in_turns(turning, factor) -> None:
     assert 'turns show 1' in found['focal_length'].line()  # 160 px
 
 
+def test_nothing_is_said_of_motion_while_frames_are_skipped(turning) -> None:
+    """Two frames, and three that are missing: how far the camera went is not known well enough."""
+    wrong = replace(CAMERA, fx=0.8 * CAMERA.fx, fy=0.8 * CAMERA.fy)
+    twice = [*turning, *(replace(f, stamp_ns=f.stamp_ns + 10**10) for f in turning[::-1])]
+    assert set(faults(twice, wrong)) == {'focal_length'}
+    assert faults([f for i, f in enumerate(twice) if i % 5 < 2], wrong) == {}
+
+
 def test_a_turn_after_a_long_way_shows_the_focal_length() -> None:
     """Once nothing was found in motion few frames are looked at, but turns are."""
     room = StereoRoom(seed=5)
