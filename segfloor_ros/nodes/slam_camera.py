@@ -130,8 +130,8 @@ class StereoInput:
         self.reset()
         self._choose(self._kinds[0])
         for info in INFOS:
-            take = partial(self._take_info, info)
-            node.inputs.subscribe(info, take, self._choose_profile, takes_all=True)
+            take, is_wanted = partial(self._take_info, info), partial(self._needs, info)
+            node.inputs.subscribe(info, take, self._choose_profile, is_wanted, takes_all=True)
         # What waits for a partner, and a whole queue that is taken at once, find room.
         for kind in self._kinds:
             node.inputs.join(
@@ -147,6 +147,9 @@ class StereoInput:
 
     def _is_chosen(self, kind: Kind) -> bool:
         return self._kind == kind
+
+    def _needs(self, info: str) -> bool:
+        return info in self._infos_needed
 
     def _take_pair(self, stamp_ns: int, pair: Pair) -> None:
         self._is_settled = True

@@ -262,7 +262,8 @@ class SlamResults:
             reporter.report(stamp_ns, Level.ERROR, MAPPING_SUBMAP, tracked=0, submap=1, **lost)
             return
         words = 'pose with a provisional mount: the floor is not seen well enough to measure it yet'
-        reporter.report_waiting(stamp_ns, words, input_faults=_faults_json(slam))
+        reporter.health.waits(words)
+        reporter.report(stamp_ns, Level.WARN, words, input_faults=_faults_json(slam))
 
     def _send_next(self) -> float:
         """Publish the oldest result that is not yet; return in how many seconds the next is due."""

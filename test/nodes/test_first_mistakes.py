@@ -139,6 +139,32 @@ def test_a_topic_that_nobody_publishes_is_one_short_line_and_its_remedy_a_diagno
     )
 
 
+def test_advice_names_the_topic_of_the_camera_and_none_that_these_nodes_make(make_graph) -> None:
+    """A depth camera by its preset; floor segmentation of another robot runs in the same network,
+    and draws on images.
+    """
+    camera = '/camera/camera/color/image_raw'
+    graph = make_graph('-p', 'use_depth:=true', '-r', f'left/image_raw:={camera}')
+    for name in ('/robot2/keyframe/floor_overlay', '/wrist/image'):
+        graph.tester.create_publisher(Image, name, TOPICS['left/image_raw'].profile)
+    graph.add(StereoSlamNode())
+    graph.add(CloudLabellingNode())
+
+    def health(node: str) -> str:
+        said = [s.message for s in graph.statuses if s.kind == HEALTH and s.node == node]
+        return said[-1] if said else ''
+
+    graph.until(lambda: '/wrist/image' in health('stereo_slam'), 'what is published')
+    text = health('stereo_slam')
+    missing, _, advice = text.partition(';')
+    assert camera in missing and 'left/image_raw' not in missing
+    assert 'overlay' not in advice and 'right/' not in text
+    graph.until(lambda: 'floor_mask' in health('cloud_labelling'), 'what is missing')
+    text = health('cloud_labelling')
+    assert '/keyframe/floor_mask is what floor_segmentation publishes' in text
+    assert '-r ' not in text
+
+
 def test_parts_that_are_missing_at_the_start_are_counted_and_not_logged(
     make_graph, console
 ) -> None:

@@ -33,6 +33,7 @@ from segfloor_ros.nodes.messages.topics import (
     FRAMES,
     IMAGES,
     NAMED_BY,
+    NODES,
     PATIENCE_S,
     PROFILES,
     SENSORS,
@@ -150,11 +151,6 @@ class Reporter:
         """Publish a status about what was processed."""
         self.health.processed(milliseconds, message)
         self.report(stamp_ns, level, message, **values, processing_ms=f'{milliseconds:.3f}')
-
-    def report_waiting(self, stamp_ns: int, message: str, **values: Any) -> None:
-        """Publish a status about what cannot be processed yet, and is kept."""
-        self.health.waits(message)
-        self.report(stamp_ns, Level.WARN, message, **values)
 
     def report_fault(self, stamp_ns: int, error: Exception) -> None:
         """Log a fault and publish a status about it."""
@@ -286,20 +282,15 @@ def _remedy(node: Node, offered: QoSProfile, wanted: QoSProfile) -> str:
 
 def lookalikes(node: Node, topic: str, kind: str) -> list[str]:
     """Return the published topics of a type, e.g. `sensor_msgs/msg/Image`, that look most like a
-    full topic name; those of the other side of a stereo pair last.
+    full topic name; those of the other side of a stereo pair last, none that these nodes make.
     """
-    own = {publisher.topic_name for publisher in node.publishers}
+    own = tuple(f'/{one.name}' for one in TOPICS.values() if one.publisher in NODES[1:])
     found = [
         name
         for name, kinds in node.get_topic_names_and_types()
-        if kind in kinds and name not in own and node.count_publishers(name)
+        if kind in kinds and not name.endswith(own) and node.count_publishers(name)
     ]
     return sorted(found, key=lambda name: -likeness(topic, name))[:MOST]
-
-
-def published_kinds(node: Node, topic: str) -> list[str]:
-    """Return the types that a full topic name is published with."""
-    return sorted({info.topic_type for info in node.get_publishers_info_by_topic(topic)})
 
 
 def likeness(wanted: str, name: str) -> float:
@@ -390,19 +381,25 @@ class Connections:
         if not silent:
             self._reporter.over('publishers')
             return
-        what = f'nobody publishes {in_words(silent)}'
-        hints = [hint for name in silent if (hint := self._hint(name))]
-        text = '; '.join([what, 'start the node that does, or remap', *hints])
+        what = f'nobody publishes {in_words([self._shown(name) for name in silent])}'
+        text = '; '.join([what, 'start the node that does, or remap', *map(self._hint, silent)])
         is_settled = now_s - min(self._silent_since_s.values()) >= PATIENCE_S
         line = f'{what}; /diagnostics says what to do' if is_settled else None
         self._reporter.diagnose('publishers', text, line=line)
 
+    def _shown(self, name: str) -> str:
+        """Return a topic as it is in the code, or the one that is taken in its place."""
+        topic = self._node.resolve_topic_name(name)
+        return name if topic == self._node.resolve_topic_name(name, only_expand=True) else topic
+
     def _hint(self, name: str) -> str:
-        """Return what is published that looks like a topic, in words; '' where nothing does."""
+        """Return what is published that looks like a topic, in words."""
         topic, kind = self._node.resolve_topic_name(name), TOPICS[name].type_name
-        others = [k for k in published_kinds(self._node, topic) if k != kind]
-        if others:
-            return f'{topic} is published as {in_words(others)}, not as {kind}'
+        infos = self._node.get_publishers_info_by_topic(topic)
+        if others := {info.topic_type for info in infos} - {kind}:
+            return f'{topic} is published as {in_words(sorted(others))}, not as {kind}'
+        if TOPICS[name].publisher in NODES[1:]:
+            return f'{topic} is what {TOPICS[name].publisher} publishes'
         found = lookalikes(self._node, topic, kind)
         if not found:
             return f'{topic}: no other topic of the type {kind} is published'
