@@ -133,3 +133,16 @@ def surroundings() -> Iterator[None]:
         changed = {'ROS_DOMAIN_ID': str(free_domain()), 'XDG_RUNTIME_DIR': folder}
         with mock.patch.dict(os.environ, changed):
             yield
+
+
+@contextlib.contextmanager
+def another_participant() -> Iterator[Node]:
+    """A node as in another process."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = Node('driver', context=context)
+    try:
+        yield node
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)

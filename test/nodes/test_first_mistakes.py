@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Iterator
 
 import pytest
-import rclpy
 from node_messages import cloud_messages, publish
 from rclpy.node import Node
+from ros_graph import another_participant
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image
 from stereo_drive import room_drive
@@ -49,19 +47,6 @@ def console(monkeypatch):
 
     monkeypatch.setattr(RcutilsLogger, 'warning', warning)
     return lines
-
-
-@contextlib.contextmanager
-def another_participant() -> Iterator[Node]:
-    """A node as in another process."""
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = Node('driver', context=context)
-    try:
-        yield node
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown(context=context)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 from geometry_msgs.msg import Twist, TwistStamped, Vector3
-from ros_graph import fresh_graph
+from ros_graph import another_participant, fresh_graph
 
 from segfloor_ros.apps.simulation.simulated_robot import SimulatedRobotNode
 from segfloor_ros.core.errors import SegfloorError
@@ -101,6 +101,19 @@ def test_a_depth_camera_takes_the_place_of_the_right_eye() -> None:
         assert depths[0].encoding == '16UC1'
         names = dict(node.get_publisher_names_and_types_by_node('simulated_robot', '/'))
         assert not any(name.startswith('/right/') for name in names)
+
+
+@pytest.mark.parametrize('is_stamped', [True, False])
+def test_commands_of_the_other_kind_are_named_with_the_parameter(is_stamped) -> None:
+    words = ('-p', f'stamped_commands:={str(is_stamped).lower()}', '-p', 'scene:=lane')
+    arguments = (*words, '-p', f"scene_values:='{SMALL}'")
+    # In one participant a topic has one type.
+    with fresh_graph(*arguments) as graph, another_participant() as teleop:
+        other = Twist if is_stamped else TwistStamped
+        teleop.create_publisher(other, 'cmd_vel', TOPICS['cmd_vel'].profile)
+        robot_in(graph)
+        remedy = f'set stamped_commands to {str(not is_stamped).lower()}'
+        graph.until(lambda: any(remedy in s.message for s in graph.statuses), 'the remedy')
 
 
 def test_a_robot_or_a_scene_that_there_is_not_ends_it_with_one_line() -> None:

@@ -88,6 +88,18 @@ class SimulatedRobotNode(StageNode[SimulatedRobotNodeSettings]):
         self._stamps_ns: list[int] = []
         self._pace = ClockPace(self.settings.rate or math.inf)
 
+    def find_problems(self) -> None:
+        """Report commands of the other kind, which do not arrive."""
+        is_stamped = self.settings.stamped_commands
+        other = Twist if is_stamped else TwistStamped
+        infos = self.get_publishers_info_by_topic('cmd_vel')
+        if any(info.topic_type.endswith(f'/{other.__name__}') for info in infos):
+            text = (
+                f'cmd_vel is published as {other.__name__}, which this node does not take; set '
+                f'stamped_commands to {str(not is_stamped).lower()}'
+            )
+            self.reporter.diagnose('kind of cmd_vel', text, Level.ERROR)
+
     def on_inputs_opened(self) -> None:
         """Keep the pace from here on."""
         self._pace.restart()

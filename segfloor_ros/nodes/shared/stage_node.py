@@ -308,9 +308,9 @@ class StageNode(LifecycleNode, ABC, Generic[Settings]):
 
     def reset(self, reason: str) -> None:
         """Drop the map and begin with an empty one, with one line in the log."""
-        self.get_logger().warning(f'reset: {reason}')
         self.kept_state.remove()
         self.reset_stage()
+        self.get_logger().warning(f'reset: {reason}')
 
     def destroy_node(self) -> None:
         """End the node and what works for it."""
