@@ -92,12 +92,12 @@ ABOUT = {
         'front, NaN: not seen. Intensities: distance of the nearest upright thing (m) or NaN.'
     ),
     'scan': (
-        "How far the floor is free per bearing at every tracked frame, in the base's plane (m), "
+        "How far the floor is free per bearing about ten times a second, in the base's plane (m), "
         'for a costmap to clear; inf: as far as can be told, -inf: blocked right in front, NaN: '
         'not seen. Published while someone listens.'
     ),
     'obstacle_scan': (
-        'How far away something stands or walks per bearing at every tracked frame, in the '
+        'How far away something stands or walks per bearing about ten times a second, in the '
         "base's plane (m), for a collision monitor; inf: nothing within `range_max`, as far as its "
         'error is half a cell. Published while someone listens.'
     ),

@@ -37,6 +37,7 @@ from segfloor_ros.nodes.messages.saved_maps import map_file_message, map_file_of
 from segfloor_ros.nodes.messages.topics import (
     CORRECTED,
     FRAME_PARTS,
+    FRESH_S,
     KEYFRAME_PARTS,
     MAP_LOADED,
     MAP_PART,
@@ -59,6 +60,10 @@ PARTS = {'cloud', 'grid'}
 """What the nodes behind know of a map."""
 
 
+FRAME_NS = 80_000_000
+"""Between small images: every third of a camera with 30 Hz, each of one with 10."""
+
+
 @dataclass(frozen=True)
 class CameraFrames:
     """Names of the optical frames of both cameras."""
@@ -73,6 +78,7 @@ class SlamTopics:
     def __init__(self, node: AnyStageNode) -> None:
         self._own: StereoSlamNodeSettings = node.settings
         self._out = node.outputs
+        self._frame_ns = -math.inf
         self.map_start_ns = 0
         """When the map was begun, by which the nodes behind know one map from another."""
         self._is_loaded = False
@@ -128,10 +134,15 @@ class SlamTopics:
         self._publish_odometry(result, '' if result.stamp_ns > self.newest_ns else CORRECTED)
         self.newest_ns = max(result.stamp_ns, self.newest_ns)
 
-    def publish_frame(self, frame: StereoFrame) -> None:
-        """Publish the rectified images of a tracked frame, shrunk, while someone listens."""
-        if not any(self._out.listeners(name) for name in FRAME_PARTS[::2]):
+    def publish_frame(self, frame: StereoFrame, is_idle: bool) -> None:
+        """Publish the rectified images of a tracked frame, shrunk, while someone listens: about ten
+        times a second where tracking leaves time for that, else as often as a robot needs them.
+        """
+        since_ns = frame.stamp_ns - self._frame_ns
+        is_due = since_ns >= (FRAME_NS if is_idle else 1e9 * FRESH_S) or since_ns < 0
+        if not is_due or not any(self._out.listeners(name) for name in FRAME_PARTS[::2]):
             return
+        self._frame_ns = frame.stamp_ns
         camera = self._calibration.camera
         factor = shrink_factor(camera)
         small = rectified_calibration(shrunk_camera(camera, factor))

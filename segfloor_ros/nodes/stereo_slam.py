@@ -195,7 +195,8 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         if not results:
             self._results.report_held(stamp_ns, slam)
         elif results[-1].stamp_ns == stamp_ns and results[-1].tracked:
-            self._results.topics.publish_frame(slam.rig_check.corrected(frame))
+            is_idle = not self._camera.pairs
+            self._results.topics.publish_frame(slam.rig_check.corrected(frame), is_idle)
         for about, remark in slam.sensors.remarks.items():
             self.reporter.diagnose(about, remark)
         self._camera.watch.report_faults(slam.rig_check.faults.values())

@@ -486,6 +486,33 @@ class TestFrameScan:
         left = grey8_image(received['frame/left/image_rect'][2], 'left')
         np.testing.assert_array_equal(left, frames[2].left)
 
+    def test_they_are_ten_a_second_and_two_where_tracking_has_no_time_left(
+        self, make_graph
+    ) -> None:
+        frames, _ = room_drive(7, step_m=0.02)
+        frames = [replace(frame, stamp_ns=frame.index * 10**9 // 30) for frame in frames]
+        graph = make_graph(*TestStereoSlam.ARGUMENTS)
+        small = graph.collect('frame/left/image_rect')
+        node = graph.add(StereoSlamNode())
+        slam = TestStereoSlam()
+        inputs = slam.inputs(graph)
+        graph.until(lambda: graph.tester.count_publishers('frame/left/image_rect'), 'the topic')
+        graph.until(lambda: node.outputs.listeners('frame/left/image_rect'), 'the listener')
+        for frame in frames:
+            slam.send(inputs, frame)
+            graph.until(
+                lambda frame=frame: frame.stamp_ns in _stamps(graph.reports('stereo_slam')), 'SLAM'
+            )
+        graph.until(lambda: len(small) == 3, 'every third frame')
+        begin_ns = frames[-1].stamp_ns
+        for tenth in range(1, 11):
+            later = replace(frames[0], stamp_ns=begin_ns + tenth * 10**8)
+            node._results.topics.publish_frame(later, is_idle=False)
+        graph.until(lambda: len(small) == 5, 'two in a second')
+        assert not graph.comes(lambda: len(small) > 5, 0.3)
+        seconds = [1e-9 * to_ns(message.header.stamp) for message in small]
+        assert seconds == pytest.approx([0.0, 0.1, 0.2, 0.7, 1.2], abs=0.001)
+
 
 def _stamps(statuses) -> set[int]:
     return {status.stamp_ns for status in statuses}

@@ -77,7 +77,7 @@ def loss_level(topic: Topic) -> Level:
     or only the latest counts, slower than asked where a sensor is missed once, wrong where the map
     lacks something for good.
     """
-    if topic.type is CameraInfo or topic.profile is FRAMES:
+    if topic.profile is FRAMES or (topic.type is CameraInfo and topic.profile is IMAGES):
         return Level.OK
     return Level.WARN if topic.profile in (IMAGES, SENSORS) else Level.ERROR
 
@@ -159,14 +159,16 @@ class Reporter:
         self.report(stamp_ns, Level.ERROR, one_line(error))
 
     def report_dropped(self, joiner: StampJoiner, publishing_nodes: Callable[[str], int]) -> None:
-        """Warn about sets that were given up, naming the topics of the missing parts."""
-        for dropped in joiner.take_dropped():
+        """Warn about sets that were given up, naming the topics of the missing parts; those of
+        which only the latest counts are nothing.
+        """
+        is_passing = all(TOPICS[name].profile is FRAMES for name in joiner.parts)
+        for dropped in joiner.take_dropped() if not is_passing else ():
             names = ', '.join(dropped.missing)
-            counts = {name: publishing_nodes(name) for name in joiner.parts}
             crowded = ''.join(
                 f'; {name} is published by {count} nodes, stop or remap one'
-                for name, count in counts.items()
-                if count > 1
+                for name in joiner.parts
+                if (count := publishing_nodes(name)) > 1
             )
             text = f'no message on {names} with stamp {dropped.stamp_ns}; dropped{crowded}'
             self.health.count('dropped')
