@@ -24,11 +24,11 @@ from segfloor_ros.core.files.arrays import Arrays
 from segfloor_ros.core.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.core.slam.held_results import NOTHING_SEEN, HeldResults, in_map
 from segfloor_ros.core.slam.mapping.back_end import BackEnd
-from segfloor_ros.core.slam.mount_search import MountSearch
-from segfloor_ros.core.slam.optional import MountMeter, Plugins
+from segfloor_ros.core.slam.mount_search import MountMeter, MountSearch
+from segfloor_ros.core.slam.optional import Plugins
 from segfloor_ros.core.slam.places.views import GroundViews
 from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, Rig
-from segfloor_ros.core.slam.session import MapSession, SessionState
+from segfloor_ros.core.slam.session import Parts, SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.snapshot import take_snapshot
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
@@ -110,20 +110,15 @@ class StereoSlam:
         self._times = times or StageTimes()
         self.sensors, self.rig_check = plugins.sensors, plugins.rig_check
         self.front_end = FrontEnd(settings, self.map, self.sensors)
-        self.back_end = BackEnd(settings, self.map, self.front_end, background, plugins.keeper)
+        self.back_end = BackEnd(settings, self.map, self.front_end, background)
         self._ground = GroundViews(self.rig)
         self._border = BlankBorder()
         self._moving = plugins.moving
-        held = HeldResults()
+        held = HeldResults(self.rig)
         self._mount_search = MountSearch(self.rig, mount_meter, self.sensors, held)
-        self.session = MapSession(
-            self.map,
-            self.front_end,
-            self.back_end,
-            self.sensors,
-            self._moving,
-            self._mount_search,
-            held,
+        search = self._mount_search
+        self.session = plugins.session(
+            Parts(self.map, self.front_end, self.back_end, self.sensors, self._moving, search, held)
         )
         self._shows_nothing = False
         self.late_masks = LateMasks(self.front_end, self.map, settings.mask_dilation_px)
@@ -191,11 +186,10 @@ class StereoSlam:
         resumed: until the camera is seen there, by what wheels measure, or with the last pose and a
         covariance that grows. Raises KeyError or ValueError for arrays that are no map.
         """
-        self.back_end.from_arrays(arrays)
+        self.session.load(arrays, last)
         self.front_end.is_fixed = localize
         self.rig.base = None
         self._mount_search.use(mount)
-        self.session.load(last)
 
     def search_near(self, T_map_base: Array, reach_m: float, reach_rad: float) -> None:
         """Look for the camera around a pose of the base (4, 4) alone, as far as somebody who knows

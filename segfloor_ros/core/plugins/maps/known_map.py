@@ -125,7 +125,7 @@ class KnownMap:
 
     def to_arrays(self) -> Arrays:
         """Return the known map and the words of its keyframes."""
-        return map_to_arrays(self._map) | self._places.to_arrays()
+        return map_and_words(self._map, self._places)
 
     def restore(self, known: Arrays) -> None:
         """Put the known map, as `to_arrays` returns it, in the place of the drive's own."""
@@ -138,6 +138,11 @@ class KnownMap:
         rows = np.minimum(rows, len(self._own.stable_id) - 1)
         there = (self._own.stable_id[rows] == stable_ids) & self._own.alive[rows]
         return np.where(there, rows, -1)
+
+
+def map_and_words(sparse_map: SparseMap, places: PlaceRecognition) -> Arrays:
+    """Return a map and the words of its keyframes."""
+    return map_to_arrays(sparse_map) | places.to_arrays()
 
 
 def merge_slam(first: Arrays, second: Arrays, rig: Rig) -> Arrays | None:
@@ -156,7 +161,7 @@ def merge_slam(first: Arrays, second: Arrays, rig: Rig) -> Arrays | None:
     places = PlaceRecognition(merged)
     places.from_arrays(words)
     _close_loops(merged, places, len(first['keyframe_stamp_ns']))
-    return map_to_arrays(merged) | places.to_arrays() | {OFFSET: first[OFFSET]}
+    return map_and_words(merged, places) | {OFFSET: first[OFFSET]}
 
 
 def _close_loops(merged: SparseMap, places: PlaceRecognition, begin: int) -> None:
@@ -186,24 +191,6 @@ def as_seen_by(camera: StereoCamera, offset_px: float, own: StereoCamera, arrays
         'feature_uvd_px': uvd_px.astype(np.float32),
         'feature_sigma_px': (arrays['feature_sigma_px'] * zoom).astype(np.float16),
     }
-
-
-class SubmapKeeper:
-    """Lets SLAM save its map, go on with one, and map a submap beside one it was lost in."""
-
-    can_hold = True
-
-    def to_arrays(self, sparse_map: SparseMap) -> Arrays:
-        """Return a map as arrays."""
-        return map_to_arrays(sparse_map)
-
-    def fill(self, sparse_map: SparseMap, arrays: Arrays) -> None:
-        """Add a map to an empty one. Raises KeyError or ValueError for arrays that are no map."""
-        fill_map(sparse_map, arrays)
-
-    def hold(self, own: SparseMap, places: PlaceRecognition, of_drive: bool) -> KnownMap:
-        """Return the present map as a known one, beside which `own` may begin anew."""
-        return KnownMap(own, map_to_arrays(own) | places.to_arrays(), of_drive)
 
 
 class FloorIndex:

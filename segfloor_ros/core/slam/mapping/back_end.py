@@ -24,7 +24,6 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     solve_global,
 )
 from segfloor_ros.core.slam.mapping.keyframe_mapping import LocalMapper
-from segfloor_ros.core.slam.optional import KnownMap, MapKeeper
 from segfloor_ros.core.slam.places.loop_closing import (
     Closing,
     apply_closing,
@@ -32,7 +31,6 @@ from segfloor_ros.core.slam.places.loop_closing import (
     solve_closing,
 )
 from segfloor_ros.core.slam.places.loops import Candidate, LoopDetector
-from segfloor_ros.core.slam.rig import OffsetEstimate
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
@@ -50,7 +48,7 @@ class BackEnd:
     loop that moves it far or once it has grown.
 
     background: on threads beside tracking; else at once, so that the outcome does not depend on
-    timing. Tracking never waits for an adjustment of the whole map. keeper: of maps as arrays.
+    timing. Tracking never waits for an adjustment of the whole map.
     """
 
     def __init__(
@@ -59,9 +57,7 @@ class BackEnd:
         sparse_map: SparseMap,
         front_end: FrontEnd,
         background: bool,
-        keeper: MapKeeper,
     ) -> None:
-        self.keeper = keeper
         self._front_end = front_end
         self._longest_frames = settings.keyframe_max_frames
         self.mapper = LocalMapper(sparse_map)
@@ -111,7 +107,7 @@ class BackEnd:
         neighbourhood. up_world: as an accelerometer has it.
         """
         self._up_world = up_world
-        self._follow(partial(self._adjust_to, keyframe, images))
+        self.follow(partial(self._adjust_to, keyframe, images))
 
     def _adjust_to(self, keyframe: KeyframeRecord, images: Images) -> bool:
         """Returns whether the map has changed already."""
@@ -127,24 +123,10 @@ class BackEnd:
     def reset(self) -> None:
         """Begin an empty map; no id is given twice."""
         self._map.reset(self._map.points.num_ever)
-        self._reset_places()
+        self.reset_places()
 
-    def merge(self, known: KnownMap) -> None:
-        """Merge the map into a known one in which its latest keyframe was recognised."""
-
-        def merge() -> bool:
-            self._reset_places(known.merge(self.places.to_arrays()))
-            return True
-
-        self._follow(merge)
-
-    def restore(self, known: KnownMap) -> None:
-        """Replace the map by a known one."""
-        arrays = known.to_arrays()
-        known.restore(arrays)
-        self._reset_places(arrays)
-
-    def _reset_places(self, words: Arrays | None = None) -> None:
+    def reset_places(self, words: Arrays | None = None) -> None:
+        """Believe in no place of the map, which is another one now. words: of its keyframes."""
         self._global.reset()
         self.places.reset()
         self.loops.reset()
@@ -152,7 +134,7 @@ class BackEnd:
         if words is not None:
             self.places.from_arrays(words)
 
-    def _follow(self, change: Callable[[], bool]) -> None:
+    def follow(self, change: Callable[[], bool]) -> None:
         """Let the camera, and with it `odom`, move along with the latest keyframe. change: of the
         map; returns whether there was any.
         """
@@ -165,7 +147,7 @@ class BackEnd:
         waited for.
         """
         if self._map.keyframes:
-            self._follow(partial(self._collect, wait))
+            self.follow(partial(self._collect, wait))
 
     def _collect(self, wait: bool) -> bool:
         """Returns whether there was anything."""
@@ -177,20 +159,6 @@ class BackEnd:
             if finished[1] is not None:
                 finished[1]()
         return any(apply is not None for apply in finished)
-
-    def to_arrays(self, known: KnownMap | None) -> Arrays:
-        """Return the map and what belongs to it, for a file. known: another map to return."""
-        offset = self._rig.offset.estimate
-        measured: Arrays = {'disparity_offset': np.array([offset.value_px, offset.information])}
-        if known is not None:
-            return known.to_arrays() | measured
-        return self.keeper.to_arrays(self._map) | self.places.to_arrays() | measured
-
-    def from_arrays(self, arrays: Arrays) -> None:
-        """Go on with what `to_arrays` returned."""
-        self.keeper.fill(self._map, arrays)
-        self.places.from_arrays(arrays)
-        self._rig.offset.estimate = OffsetEstimate(*arrays['disparity_offset'].tolist())
 
     def close(self) -> None:
         """End the background threads, if there are any."""

@@ -11,7 +11,6 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.geometry import invert, make_transform
 from segfloor_ros.core.plugins.assembly import equipped_slam
-from segfloor_ros.core.plugins.maps.known_map import SubmapKeeper
 from segfloor_ros.core.plugins.maps.map_arrays import fill_map, map_to_arrays, moved
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.slam.mapping import back_end
@@ -224,7 +223,7 @@ def closing_loops(closed, monkeypatch, background):
     sparse_map, none = SparseMap(closed[0].rig), np.zeros(0, np.int32)
     fill_map(sparse_map, map_to_arrays(closed[0].map))
     front_end = FrontEnd(SETTINGS, sparse_map, BodyMotion())
-    mapping = back_end.BackEnd(SETTINGS, sparse_map, front_end, background, SubmapKeeper())
+    mapping = back_end.BackEnd(SETTINGS, sparse_map, front_end, background)
     last = sparse_map.keyframes[-1]
 
     def close(off_m):
