@@ -124,7 +124,7 @@ SLAM: dict[str, Mechanism] = {
         {'core.slam.places.place_recognition.is_enough': lambda *_: True}
     ),
     'what stands around a place': Mechanism(
-        {'core.slam.places.loops.PlaceMatcher.around': lambda *_: np.inf}
+        {'core.plugins.maps.known_map.KnownPlaces.around': lambda *_: np.inf}
     ),
     'other places that a view fits': Mechanism(
         {'core.slam.places.loops.PlaceMatcher.agree': lambda *_: True}

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.contracts import NO_POINT, RelativeMotion, Up
-from segfloor_ros.core.files.arrays import Arrays, check_lengths
 from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.slam.rig import Observations, Rig
 from segfloor_ros.core.slam.thresholds import PROOF
@@ -34,20 +33,17 @@ MAX_PATCH_ZOOM = 1.3
 
 @dataclass(frozen=True)
 class Column:
-    """A column of rows of some shape. start: the value of a new point, unless it is given.
-    in_file: whether a file has it; the others follow from the rest.
-    """
+    """A column of rows of some shape. start: the value of a new point, unless it is given."""
 
     dtype: type
     shape: tuple[int, ...] = ()
     start: Any = 0
-    in_file: bool = True
 
 
 COLUMNS = {
     'xyz_world': Column(np.float64, (3,)),
     'stable_id': Column(np.int32),
-    'alive': Column(np.bool_, start=True, in_file=False),
+    'alive': Column(np.bool_, start=True),
     'descriptor': Column(np.uint8, (32,)),
     'patch': Column(np.uint8, (SIDE_PX, SIDE_PX)),
     'patch_distance_m': Column(np.float32),
@@ -56,14 +52,11 @@ COLUMNS = {
     'viewing_direction': Column(np.float32, (3,)),
     'visible_count': Column(np.int32, start=1),
     'found_count': Column(np.int32, start=1),
-    'observer_count': Column(np.int32, in_file=False),
+    'observer_count': Column(np.int32),
     'seen_through_count': Column(np.int32),
     'born': Column(np.int32),
     'seen_last': Column(np.int32),
 }
-
-OF_KEYFRAMES = ('born', 'seen_last')
-"""Columns that hold indices of keyframes."""
 
 
 class PointRows:
@@ -107,26 +100,6 @@ class PointRows:
     def reliability(self, rows: NDArray[np.integer]) -> Array:
         """Return how likely points (N,) are to be found when they should be seen, in (0, 1)."""
         return np.asarray(self['found_count'][rows] / (self['visible_count'][rows] + 2.0))
-
-    def to_arrays(self, rows: NDArray[np.intp]) -> Arrays:
-        """Return what a file holds of some rows (N,)."""
-        arrays: Arrays = {
-            f'point_{name}': self[name][rows] for name, column in COLUMNS.items() if column.in_file
-        }
-        return arrays | {'num_ever': np.array([self.num_ever])}
-
-    def from_arrays(self, arrays: Arrays, first_keyframe: int) -> None:
-        """Add what `to_arrays` returned, behind points that are all alive; its keyframes are
-        counted from first_keyframe on. Raises KeyError or ValueError for other arrays.
-        """
-        kept = [name for name, column in COLUMNS.items() if column.in_file]
-        check_lengths({name: arrays[f'point_{name}'] for name in kept})
-        rows = self.add(len(arrays['point_stable_id']))
-        for name in kept:
-            self[name][rows] = arrays[f'point_{name}']
-        for name in OF_KEYFRAMES:
-            self[name][rows] += first_keyframe
-        self.num_ever = int(arrays['num_ever'][0])
 
 
 Observers = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]

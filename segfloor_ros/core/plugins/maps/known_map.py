@@ -12,16 +12,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.contracts import NO_POINT
+from segfloor_ros.core.contracts import NO_POINT, Mount
 from segfloor_ros.core.files.arrays import Arrays
-from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.plugins.maps.map_arrays import fill_map, map_to_arrays, moved
 from segfloor_ros.core.slam.mapping.bundle_adjustment import apply_global, copy_map, solve_global
+from segfloor_ros.core.slam.places.evidence import of_counts
 from segfloor_ros.core.slam.places.loop_closing import (
     apply_closing,
     fuse_latest,
@@ -30,21 +33,75 @@ from segfloor_ros.core.slam.places.loop_closing import (
     plan_closing,
     solve_closing,
 )
-from segfloor_ros.core.slam.places.loops import LoopDetector, PlaceMatcher, drift
+from segfloor_ros.core.slam.places.loops import UP_SIGMA_M, LoopDetector, PlaceMatcher, drift
 from segfloor_ros.core.slam.places.place_recognition import (
     PlaceIndex,
     PlaceRecognition,
     Relocaliser,
     Vocabulary,
+    greatest_speed_mps,
 )
-from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, OffsetEstimate, Rig
-from segfloor_ros.core.slam.sparse_map import GroundView, KeyframeRecord, Match, SparseMap
+from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, OffsetEstimate, Rig, chi2_limit
+from segfloor_ros.core.slam.sparse_map import (
+    LINK_SIGMA,
+    GroundView,
+    KeyframeRecord,
+    Match,
+    SparseMap,
+)
+from segfloor_ros.core.slam.thresholds import SAME
 from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.map_tracking import Pixels
 from segfloor_ros.core.slam.tracking.track import Track
 
 OFFSET = 'disparity_offset'
 """What a map knows of the disparity offset, by name."""
+
+
+class KnownPlaces(PlaceMatcher):
+    """Matches keyframes with the places of another map than their own."""
+
+    def is_within_reach(self, match: Match) -> bool:
+        """Whether the robot can have come there while it was lost: from the last keyframe of the
+        known map to the first of its own.
+        """
+        first, known = self._map.keyframes[0], self._known.keyframes
+        T_own_known = drift(self._map, match)
+        way = known[-1].T_camera_world @ invert(first.T_camera_world @ T_own_known)
+        lost_s = 1e-9 * (first.stamp_ns - known[-1].stamp_ns)
+        return bool(np.linalg.norm(way[:3, 3]) <= SAME[0] + greatest_speed_mps(known) * lost_s)
+
+    def around(self, match: Match) -> float:
+        """Return how much likelier what stands around the keyframe stands where the known map has
+        it than in a place beside: floors repeat themselves.
+        """
+        mount = self._map.rig.mount
+        if mount is None:
+            return 0.0
+        recent = np.arange(max(0, match.keyframe - NEIGHBOURS), match.keyframe + 1)
+        own = upright(self._map, mount, self._map.points_of(recent))
+        own = transform_points(invert(drift(self._map, match)), own)
+        reach_m = np.sqrt(chi2_limit(3)) * LINK_SIGMA[0]
+        along, aside, _ = mount.T_base_left[:3, :3]
+        angles = np.linspace(0.0, 2 * np.pi, 8, endpoint=False)
+        ring = reach_m * (np.outer(np.cos(angles), along) + np.outer(np.sin(angles), aside))
+        shifts = np.concatenate([np.zeros((1, 3)), 4 * ring, 8 * ring, 12 * ring])
+        gaps_m, _ = self._upright.query(own[:, None] + shifts, distance_upper_bound=reach_m)
+        here, *beside = np.isfinite(gaps_m).sum(axis=0)
+        return of_counts(here, max(beside))
+
+    @cached_property
+    def _upright(self) -> cKDTree:
+        """What stands in the known map, once it does not change any more."""
+        assert self._map.rig.mount is not None
+        alive = np.flatnonzero(self._known.alive)
+        return cKDTree(upright(self._known, self._map.rig.mount, alive))
+
+
+def upright(sparse_map: SparseMap, mount: Mount, ids: NDArray[np.integer]) -> Array:
+    """Return those of points (N,), (M, 3), that stand clearly above the floor."""
+    xyz = sparse_map.xyz_world[ids]
+    return xyz[transform_points(mount.T_base_left, xyz)[:, 2] > 4 * UP_SIGMA_M]
 
 
 class KnownMap:
@@ -58,7 +115,7 @@ class KnownMap:
         self._places = PlaceRecognition(self._map)
         self._places.from_arrays(arrays)
         self._relocaliser = Relocaliser(self._map, self._places)
-        self._matcher = PlaceMatcher(own, self._map, self._places)
+        self._matcher = KnownPlaces(own, self._map, self._places)
         self._floors = FloorIndex(self._map.keyframes)
 
     @property

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +17,10 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from segfloor_ros.core.contracts import NO_POINT, Mount
+from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.core.slam.places.evidence import HOPELESS, PlaceEvidence, of_counts, of_errors
-from segfloor_ros.core.slam.places.place_recognition import (
-    PlaceRecognition,
-    Sightings,
-    greatest_speed_mps,
-)
+from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition, Sightings
 from segfloor_ros.core.slam.places.views import (
     ALIKE_SHARE,
     motion_between,
@@ -43,7 +38,7 @@ from segfloor_ros.core.slam.sparse_map import (
     features_of,
     loop_sigma,
 )
-from segfloor_ros.core.slam.thresholds import ENOUGH, PROOF, SAME
+from segfloor_ros.core.slam.thresholds import ENOUGH, PROOF
 from segfloor_ros.core.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels
 from segfloor_ros.core.twists import is_within
 
@@ -261,7 +256,7 @@ class PlaceMatcher:
         """Return what a keyframe says for a match. A floor alone could be anywhere in a map: there
         it counts no more than what stands around.
         """
-        around = np.inf if self._known is self._map else self.around(match)
+        around = self.around(match)
         by_points = len(match.rows) > 0
         return PlaceEvidence(
             look=match.log_ratio if by_points else 0.0,
@@ -291,16 +286,6 @@ class PlaceMatcher:
         sigmas = np.sqrt(2 * chi2_limit(6, GATE)) * LOOP_FACTOR
         return is_within(gap, (sigmas * LINK_SIGMA[0], sigmas * LINK_SIGMA[1]))
 
-    def is_within_reach(self, match: Match) -> bool:
-        """Whether the robot can have come there while it was lost: from the last keyframe of the
-        known map to the first of its own.
-        """
-        first, known = self._map.keyframes[0], self._known.keyframes
-        T_own_known = drift(self._map, match)
-        way = known[-1].T_camera_world @ invert(first.T_camera_world @ T_own_known)
-        lost_s = 1e-9 * (first.stamp_ns - known[-1].stamp_ns)
-        return bool(np.linalg.norm(way[:3, 3]) <= SAME[0] + greatest_speed_mps(known) * lost_s)
-
     def level(self, match: Match) -> float:
         """Return how likely it is that the robot stands as high and as level as at the place."""
         mount = self._map.rig.mount
@@ -316,29 +301,9 @@ class PlaceMatcher:
 
     def around(self, match: Match) -> float:
         """Return how much likelier what stands around the keyframe stands where the known map has
-        it than in a place beside: floors repeat themselves.
+        it than in a place beside, in nats: no limit to what is seen within one map.
         """
-        mount = self._map.rig.mount
-        if mount is None:
-            return 0.0
-        recent = np.arange(max(0, match.keyframe - NEIGHBOURS), match.keyframe + 1)
-        own = upright(self._map, mount, self._map.points_of(recent))
-        own = transform_points(invert(drift(self._map, match)), own)
-        reach_m = np.sqrt(chi2_limit(3)) * LINK_SIGMA[0]
-        along, aside, _ = mount.T_base_left[:3, :3]
-        angles = np.linspace(0.0, 2 * np.pi, 8, endpoint=False)
-        ring = reach_m * (np.outer(np.cos(angles), along) + np.outer(np.sin(angles), aside))
-        shifts = np.concatenate([np.zeros((1, 3)), 4 * ring, 8 * ring, 12 * ring])
-        gaps_m, _ = self._upright.query(own[:, None] + shifts, distance_upper_bound=reach_m)
-        here, *beside = np.isfinite(gaps_m).sum(axis=0)
-        return of_counts(here, max(beside))
-
-    @cached_property
-    def _upright(self) -> cKDTree:
-        """What stands in the known map, once it does not change any more."""
-        assert self._map.rig.mount is not None
-        alive = np.flatnonzero(self._known.alive)
-        return cKDTree(upright(self._known, self._map.rig.mount, alive))
+        return np.inf
 
     def _sides(self, keyframe: KeyframeRecord, match: Match) -> float:
         """Return how much likelier than not the keyframe's own points lie where the place's
@@ -394,12 +359,6 @@ def drift(sparse_map: SparseMap, match: Match) -> Array:
     """Return the (4, 4) that brings a place's coordinates into those of the keyframe's map."""
     own = sparse_map.keyframes[match.keyframe].T_camera_world
     return invert(own) @ match.T_camera_world
-
-
-def upright(sparse_map: SparseMap, mount: Mount, ids: NDArray[np.integer]) -> Array:
-    """Return those of points (N,), (M, 3), that stand clearly above the floor."""
-    xyz = sparse_map.xyz_world[ids]
-    return xyz[transform_points(mount.T_base_left, xyz)[:, 2] > 4 * UP_SIGMA_M]
 
 
 def median_depth_m(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:
