@@ -135,6 +135,13 @@ class Observations:
     uvd_px: NDArray[np.floating]
     sigma_px: NDArray[np.floating]
 
+    @staticmethod
+    def of_pixels(uv_px: NDArray[np.floating], sigma_px: Array | float) -> Observations:
+        """Return pixels (N, 2) before any disparity is known. sigma_px: of all, or (N, 1)."""
+        uvd, sigma = np.full((len(uv_px), 3), np.nan), np.ones((len(uv_px), 3))
+        uvd[:, :2], sigma[:, :2] = uv_px, sigma_px
+        return Observations(uvd, sigma)
+
     def __len__(self) -> int:
         return len(self.uvd_px)
 

@@ -25,16 +25,12 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     gather,
 )
 from segfloor_ros.core.slam.mapping.normal_equations import factors_of, motion_before
-from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, SAME_PX
+from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, ENOUGH, MAJORITY, NEARLY_ALL, PROOF
 from segfloor_ros.core.slam.tracking.images import MAX_HAMMING, Images, hamming, one_to_one
 from segfloor_ros.core.slam.tracking.map_tracking import predict_points
-from segfloor_ros.core.slam.tracking.patch_alignment import (
-    ALIGNED_PX,
-    guess_disparity,
-    measure_disparity,
-)
+from segfloor_ros.core.slam.tracking.patch_alignment import ALIGNED_PX, measure_disparities
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures
 from segfloor_ros.core.timing import timed
 
@@ -91,12 +87,7 @@ class LocalMapper:
         missing = np.flatnonzero(
             np.isnan(observations.uvd_px[:, 2]) & (observed.point_id == NO_POINT)
         )
-        uv_px = observations.uvd_px[missing, :2]
-        guess: Array = np.zeros(len(missing))
-        if not images.depth_scale:
-            guess = guess_disparity(frame.left, frame.right, uv_px)
-        found = np.isfinite(guess)
-        measure_disparity(images, observations, missing[found], guess[found], SAME_PX)
+        measure_disparities(frame, images, observations, missing)
 
     @timed
     def insert(self, keyframe: KeyframeRecord, patches: NDArray[np.uint8]) -> None:

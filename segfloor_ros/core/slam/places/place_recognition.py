@@ -26,7 +26,6 @@ from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from segfloor_ros.core.files.arrays import Arrays, joined, split
 from segfloor_ros.core.geometry import Array, invert, transform_points
@@ -182,9 +181,7 @@ class PlaceRecognition:
 
     def locate(self, images: Pixels, features: Features, ids: NDArray[np.int32]) -> Track | None:
         """Find a camera among points `ids` (N,); None unless it sees them."""
-        observations = self._tracker.pixel_observations(features)
-        tree = cKDTree(features.uv_px)
-        estimate = self._tracker.locate(features, tree, observations, ids)
+        estimate = self._tracker.locate(features, ids)
         if estimate is None:
             return None
         return self.confirm(images, features, ids, estimate.T_camera_world)

@@ -311,7 +311,7 @@ class FrontEnd:
                 estimate = PoseEstimate(first, np.zeros(0, bool), sure, 1.0)
                 self.frame_to_frame.see(frame, images, estimate)
             none = np.full(len(features), NO_POINT, np.int32)
-            return ObservedFeatures(features, self.tracker.pixel_observations(features), none)
+            return ObservedFeatures(features, features.observations, none)
         pose = self.motion.T_camera_world
         matched = self.tracker.track_at(
             images, features, self.local.point_ids, pose, track.estimate

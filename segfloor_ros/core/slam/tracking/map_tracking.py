@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from segfloor_ros.core.camera.pixels import Region
 from segfloor_ros.core.contracts import NO_POINT
@@ -55,11 +54,6 @@ from segfloor_ros.core.slam.tracking.pose import Consensus, PoseEstimate, Search
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
 
-SIGMA_PIXEL = 0.6
-"""Standard deviation of a corner's position at the finest pyramid level, px; grows with the
-level.
-"""
-
 NARROW_PX, USUAL_PX, WIDE_PX = 6.0, 15.0, 45.0
 """Search radius around a predicted pixel, at the finest pyramid level: once a pose is known from
 this very frame; by a prediction; and when that finds too little."""
@@ -91,15 +85,6 @@ class Tracker:
         self.consensus = Consensus(sparse_map)
         self._map = sparse_map
 
-    def pixel_observations(self, features: Features) -> Observations:
-        """Return the observations of features (N) before any disparity is known."""
-        uvd = np.full((len(features), 3), np.nan)
-        uvd[:, :2] = features.uv_px
-        sigma = np.full((len(features), 3), 1.0)
-        scale = PYRAMID_SCALE ** features.octave.astype(np.float64)
-        sigma[:, :2] = SIGMA_PIXEL * scale[:, None]
-        return Observations(uvd, sigma)
-
     def best(
         self,
         images: Images,
@@ -115,11 +100,9 @@ class Tracker:
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
-        tree = cKDTree(features.uv_px)
-        observations = self.pixel_observations(features)
         best: Track | None = None
         for start in starts:
-            coarse = self._coarse(features, tree, observations, local_ids, start)
+            coarse = self._coarse(features, local_ids, start)
             if coarse is None:
                 continue
             track = self.track_at(images, features, local_ids, coarse.T_camera_world)
@@ -150,12 +133,11 @@ class Tracker:
             return None
         offset_px = self._map.rig.offset.value_px
         if isinstance(images, Images):
-            observations, excluded = self.pixel_observations(features), images.excluded
+            observations, excluded = features.observations, images.excluded
         else:
             observations, excluded = images, None
         seen = predict_points(self._map, local_ids, T_camera_world, excluded)
-        tree = cKDTree(features.uv_px)
-        points, rows, area_px2 = self._search(features, tree, seen, NARROW_PX)
+        points, rows, area_px2 = self._search(features, seen, NARROW_PX)
         if len(rows) == 0:
             return None
         ids = seen.ids[points]
@@ -184,14 +166,12 @@ class Tracker:
             ),
         )
 
-    def locate(
-        self, features: Features, tree: cKDTree, observations: Observations, ids: NDArray[np.int32]
-    ) -> PoseEstimate | None:
+    def locate(self, features: Features, ids: NDArray[np.int32]) -> PoseEstimate | None:
         """Find the pose among map points without a prediction: descriptors alone and PnP-RANSAC for
         a first guess, which then has to find more points where they should be.
         """
         start = self.by_descriptors(features, ids)
-        return None if start is None else self._coarse(features, tree, observations, ids, start)
+        return None if start is None else self._coarse(features, ids, start)
 
     def by_descriptors(self, features: Features, ids: NDArray[np.int32]) -> Start | None:
         """Return the pose that most of the map points `ids` (N,) agree with whose descriptors are
@@ -203,39 +183,29 @@ class Tracker:
         return None if found is None else Start(found[0])
 
     def _coarse(
-        self,
-        features: Features,
-        tree: cKDTree,
-        observations: Observations,
-        local_ids: NDArray[np.int32],
-        start: Start,
+        self, features: Features, local_ids: NDArray[np.int32], start: Start
     ) -> PoseEstimate | None:
         """Return the pose by the features around a start; None where there is no evidence."""
         seen = predict_points(self._map, local_ids, start.T_camera_world)
-        points, rows, area_px2 = self._search(features, tree, seen, start.radius_px)
+        points, rows, area_px2 = self._search(features, seen, start.radius_px)
         if len(rows) == 0:
             return None
         missed, by_chance = len(seen.ids) - len(rows), min(start.radius_px * FOUND_PER_PX, 1.0)
         searched = Searched(area_px2, None, missed, by_chance)
         found = self.consensus.refine(
-            start.T_camera_world, seen.ids[points], observations.take(rows), searched
+            start.T_camera_world, seen.ids[points], features.observations.take(rows), searched
         )
         return found if is_proof(found.evidence()) else None
 
     def _search(
-        self, features: Features, tree: cKDTree, seen: Prediction, radius_px: float
+        self, features: Features, seen: Prediction, radius_px: float
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
         """Return pairs of points (N,) and features (N,) and the areas (N,) they were looked for
         in.
         """
         reach_px = radius_px * PYRAMID_SCALE ** np.clip(seen.octave, 0, None)
         points, rows = match_predicted(
-            features,
-            tree,
-            seen.uvd_px[:, :2],
-            seen.octave,
-            self._map.descriptor[seen.ids],
-            reach_px,
+            features, seen.uvd_px[:, :2], seen.octave, self._map.descriptor[seen.ids], reach_px
         )
         return points, rows, np.pi * reach_px[points] ** 2
 
@@ -475,8 +445,7 @@ class Follower:
         found &= ~is_inside(images.excluded, uv)
         if not found.any():
             return None
-        uvd = np.column_stack([uv[found], np.full(int(found.sum()), np.nan)])
-        observations = Observations(uvd, np.full(uvd.shape, SIGMA_FLOW_PX))
+        observations = Observations.of_pixels(uv[found], SIGMA_FLOW_PX)
         searched = Searched(float(SIDE_PX * width / self._small.shape[1]) ** 2)
         roughly = self._consensus.refine(T_predicted, ids[found], observations, searched)
         return roughly if is_proof(roughly.evidence()) else None

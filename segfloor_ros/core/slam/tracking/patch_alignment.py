@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.pixels import SUBPIXEL, disparity_at
+from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.slam.rig import MAX_DISPARITY_SHARE, Observations
+from segfloor_ros.core.slam.rig import MAX_DISPARITY_SHARE, SAME_PX, Observations
 from segfloor_ros.core.slam.thresholds import MAJORITY
 from segfloor_ros.core.slam.tracking.images import SIDE_PX, SMALL_WIDTH_PX, Images
 from segfloor_ros.core.timing import timed
@@ -372,6 +373,17 @@ def measure_disparity(
         disparity, sigma = refine_disparity(images.left, images.right, uv_px, guess_px, reach_px)
     observations.uvd_px[rows, 2] = disparity
     observations.sigma_px[rows, 2] = np.clip(sigma, MIN_SIGMA_DISPARITY, None)
+
+
+def measure_disparities(
+    frame: StereoFrame, images: Images, observations: Observations, rows: NDArray[np.intp]
+) -> None:
+    """Set, in place, the disparities of observations `rows` (N,), wherever they are found."""
+    guess: Array = np.zeros(len(rows))
+    if not images.depth_scale:
+        guess = guess_disparity(frame.left, frame.right, observations.uvd_px[rows, :2])
+    found = np.isfinite(guess)
+    measure_disparity(images, observations, rows[found], guess[found], SAME_PX)
 
 
 def refine_disparity(
