@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.contracts import NO_POINT, RelativeMotion, Up
-from segfloor_ros.core.geometry import Array, invert
-from segfloor_ros.core.slam.rig import Observations, Rig
+from segfloor_ros.core.geometry import Array, invert, transform_points
+from segfloor_ros.core.slam.rig import MIN_DEPTH_M, Observations, Rig
 from segfloor_ros.core.slam.thresholds import PROOF
 from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.patch_alignment import SIDE_PX
@@ -303,6 +303,11 @@ class KeyframeRecord:
         """The camera's pose (4, 4)."""
         return invert(self.T_camera_world)
 
+    @property
+    def seen_ids(self) -> NDArray[np.int32]:
+        """The rows (N,) of the points that its features show."""
+        return self.point_id[self.point_id != NO_POINT]
+
 
 def _column(name: str) -> Any:
     """Return a property that is a column of the points, a writable view indexed by row."""
@@ -522,12 +527,15 @@ class SparseMap:
 
     def covisible(self, ids: NDArray[np.integer]) -> Covisible:
         """Return the keyframes that observe any of the points (N,)."""
-        wanted = np.zeros(len(self.alive), bool)
-        wanted[ids] = True
-        shared = self.edges.count(wanted)
+        shared = self.edges.count(self._are(ids))
         order = np.lexsort((-np.arange(len(shared)), -shared))
         order = order[shared[order] > 0]
         return order, shared[order]
+
+    def median_depth_m(self, ids: NDArray[np.integer], T_camera_world: Array) -> float:
+        """Return the median depth of points (N,) before a camera."""
+        depth = transform_points(T_camera_world, self.xyz_world[ids])[:, 2]
+        return max(float(np.median(depth)), MIN_DEPTH_M) if len(ids) else MIN_DEPTH_M
 
     def points_of(self, keyframe_indices: NDArray[np.integer]) -> NDArray[np.int32]:
         """Return the ascending rows of all points that the keyframes observe."""
@@ -538,9 +546,13 @@ class SparseMap:
 
     def edges_of(self, ids: NDArray[np.integer]) -> Observers:
         """Return all observations of the points (N,)."""
+        return self.edges.to(self._are(ids))
+
+    def _are(self, ids: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Return which points (P,) are among some (N,)."""
         wanted = np.zeros(len(self.alive), bool)
         wanted[ids] = True
-        return self.edges.to(wanted)
+        return wanted
 
 
 def features_of(sparse_map: SparseMap, keyframe: KeyframeRecord) -> Features:

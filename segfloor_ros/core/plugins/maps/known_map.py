@@ -30,8 +30,8 @@ from segfloor_ros.core.slam.places.loop_closing import (
     fuse_latest,
     loop_edge,
     merge_pairs,
+    optimise,
     plan_closing,
-    solve_closing,
 )
 from segfloor_ros.core.slam.places.loops import UP_SIGMA_M, LoopDetector, PlaceMatcher, drift
 from segfloor_ros.core.slam.places.place_recognition import (
@@ -230,7 +230,7 @@ def _close_loops(merged: SparseMap, places: PlaceRecognition, begin: int) -> Non
         matches = loops.detect(keyframe, keyframe.observations.exact())
         if matches:
             closing = plan_closing(merged, matches)
-            apply_closing(merged, closing, solve_closing(closing))
+            apply_closing(merged, closing, optimise(closing.graph))
     copied = copy_map(merged, merged.rig.offset.estimate, None)
     apply_global(merged, solve_global(merged.rig.camera, copied, lambda: True))
 

@@ -27,8 +27,8 @@ from segfloor_ros.core.slam.mapping.keyframe_mapping import LocalMapper
 from segfloor_ros.core.slam.places.loop_closing import (
     Closing,
     apply_closing,
+    optimise,
     plan_closing,
-    solve_closing,
 )
 from segfloor_ros.core.slam.places.loops import Candidate, LoopDetector
 from segfloor_ros.core.slam.settings import StereoSlamSettings
@@ -151,14 +151,10 @@ class BackEnd:
 
     def _collect(self, wait: bool) -> bool:
         """Returns whether there was anything."""
-        finished = [self._local.collect(wait)]
-        if finished[0] is not None:
-            finished[0]()
+        has_changed = self._local.collect(wait)
         if not self._local.holds_one:
-            finished.append(self._global.collect(wait=False))
-            if finished[1] is not None:
-                finished[1]()
-        return any(apply is not None for apply in finished)
+            has_changed |= self._global.collect(wait=False)
+        return has_changed
 
     def close(self) -> None:
         """End the background threads, if there are any."""
@@ -185,7 +181,7 @@ class BackEnd:
             return False
         closing = plan_closing(self._map, matches)
         self._is_closing = True
-        self._local.submit(partial(solve_closing, closing), partial(self._apply, closing))
+        self._local.submit(partial(optimise, closing.graph), partial(self._apply, closing))
         return True
 
     def _apply(self, closing: Closing, result: tuple[Array, Array]) -> None:
@@ -257,16 +253,16 @@ class AdjustmentRunner:
             self._result = Future()
             self._result.set_result(solve())
 
-    def collect(self, wait: bool) -> Callable[[], None] | None:
-        """Return what applies a finished adjustment, once, or None; with `wait` a running one is
-        waited for.
+    def collect(self, wait: bool) -> bool:
+        """Apply a finished adjustment; with `wait` a running one is waited for. Returns whether
+        there was one.
         """
         apply = self._apply
         if apply is None or not (wait or self._result.done()):
-            return None
+            return False
         self._apply = None
-        result = self._result.result()
-        return lambda: apply(result)
+        apply(self._result.result())
+        return True
 
     def close(self) -> None:
         """Wait for a running adjustment and end the thread."""

@@ -103,7 +103,7 @@ class LocalMapper:
         """Return the earlier keyframes that share most points with a new one; the one before it
         where none does.
         """
-        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        own = keyframe.seen_ids
         order, shared = self._map.covisible(own)
         enough = max(ENOUGH, CHANCE_SHARE * len(own))
         near = order[(shared >= enough) & (order != keyframe.index)]
@@ -187,7 +187,7 @@ class LocalMapper:
         """Return the covisible keyframes that move and those that hold them; the first one
         does not move here.
         """
-        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        own = keyframe.seen_ids
         order, shared = self._map.covisible(own)
         near = order[(shared >= ENOUGH) & (order != keyframe.index)]
         near = np.concatenate([near, np.setdiff1d(_linked(self._map, keyframe), near)[::-1]])
@@ -234,7 +234,7 @@ def find_duplicates(sparse_map: SparseMap, keyframe: KeyframeRecord) -> Pairs:
     """Return pairs of point rows (N,), (N,): of the keyframe, and of its neighbours alone. Each
     point occurs at most once.
     """
-    own = np.unique(keyframe.point_id[keyframe.point_id != NO_POINT])
+    own = np.unique(keyframe.seen_ids)
     order, _ = sparse_map.covisible(own)
     around = sparse_map.points_of(order[:NEIGHBOURS])
     others = around[~np.isin(around, own)]
@@ -265,7 +265,7 @@ def retire_redundant(sparse_map: SparseMap, candidates: NDArray[np.integer]) -> 
     for index in sorted(int(k) for k in candidates if 0 < k < last):
         keyframe = sparse_map.keyframes[index]
         if keyframe.retired is None and redundant_share(sparse_map, keyframe) >= NEARLY_ALL:
-            order, _ = sparse_map.covisible(keyframe.point_id[keyframe.point_id != NO_POINT])
+            order, _ = sparse_map.covisible(keyframe.seen_ids)
             reference = order[order != index][0]
             sparse_map.retire(keyframe, sparse_map.keyframes[reference])
 

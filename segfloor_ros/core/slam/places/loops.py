@@ -28,7 +28,7 @@ from segfloor_ros.core.slam.places.views import (
     seen_ahead_m,
     views_near,
 )
-from segfloor_ros.core.slam.rig import GATE, MIN_DEPTH_M, NEIGHBOURS, SAME_PX, chi2_limit, in_view
+from segfloor_ros.core.slam.rig import GATE, NEIGHBOURS, SAME_PX, chi2_limit, in_view
 from segfloor_ros.core.slam.sparse_map import (
     LINK_SIGMA,
     LOOP_FACTOR,
@@ -115,7 +115,7 @@ class LoopDetector:
 
     def _linked(self, keyframe: KeyframeRecord) -> NDArray[np.bool_]:
         """Return which keyframes (K,) a view is linked to already."""
-        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        own = keyframe.seen_ids
         linked, shared = self._map.covisible(own)
         near = np.arange(len(self._map.keyframes)) > keyframe.index - NEIGHBOURS
         near[linked[shared > max(ENOUGH, ALIKE_SHARE * len(own))]] = True
@@ -207,7 +207,7 @@ class PlaceMatcher:
         features = features_of(self._map, keyframe)
         if self.matches:
             pose = keyframe.T_camera_world @ drift(self._map, self.matches[-1])
-            depth_m = median_depth_m(self._map, keyframe)
+            depth_m = self._map.median_depth_m(keyframe.seen_ids, keyframe.T_camera_world)
             around = views_near(self._known, pose, depth_m, len(may_show))
             ids = self._places.points_of(around[may_show[around]][:NEIGHBOURS], own_ids)
             track = self._places.confirm(images, features, ids, pose)
@@ -274,7 +274,8 @@ class PlaceMatcher:
 
     def _newness(self, matches: list[Match]) -> list[float]:
         """Return how new the view of each keyframe is to those before it."""
-        depth_m = median_depth_m(self._map, self._map.keyframes[matches[-1].keyframe])
+        latest = self._map.keyframes[matches[-1].keyframe]
+        depth_m = self._map.median_depth_m(latest.seen_ids, latest.T_camera_world)
         poses = np.stack([match.T_camera_world for match in matches])
         new = novelty(poses[:, None] @ invert(poses), depth_m)
         return [float(new[k, :k].min(initial=1.0)) for k in range(len(matches))]
@@ -326,8 +327,7 @@ class PlaceMatcher:
         points of the other: the rays to what is seen are free.
         """
         place = self._known.keyframes[match.place]
-        own = keyframe.point_id[keyframe.point_id != NO_POINT]
-        known = place.point_id[place.point_id != NO_POINT]
+        own, known = keyframe.seen_ids, place.seen_ids
         if self._known is self._map:
             own = np.setdiff1d(own, known)
         in_now = transform_points(keyframe.T_camera_world, self._map.xyz_world[own])
@@ -359,10 +359,3 @@ def drift(sparse_map: SparseMap, match: Match) -> Array:
     """Return the (4, 4) that brings a place's coordinates into those of the keyframe's map."""
     own = sparse_map.keyframes[match.keyframe].T_camera_world
     return invert(own) @ match.T_camera_world
-
-
-def median_depth_m(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:
-    """Return the median depth of what a keyframe sees."""
-    ids = keyframe.point_id[keyframe.point_id != NO_POINT]
-    depth = transform_points(keyframe.T_camera_world, sparse_map.xyz_world[ids])[:, 2]
-    return max(float(np.median(depth)), MIN_DEPTH_M) if len(ids) else MIN_DEPTH_M

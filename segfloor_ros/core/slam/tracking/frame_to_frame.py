@@ -33,7 +33,7 @@ from segfloor_ros.core.slam.tracking.pose import (
     solve_pnp,
 )
 from segfloor_ros.core.timing import timed
-from segfloor_ros.core.twists import adjoint, without_drift
+from segfloor_ros.core.twists import compounded, without_drift
 
 FEATURES, ITERATIONS = 2000, 5000
 """Corners of an image, wherever they are, and draws of RANSAC: where one match in seven is right,
@@ -100,12 +100,11 @@ class FrameToFrame:
         near = PoseEstimate(np.eye(4), moved.inliers, ANYWHERE, 1.0)
         if not is_proof(moved.evidence(near)):
             return None
-        A = adjoint(moved.T_camera_world)
-        return replace(
-            moved,
-            T_camera_world=moved.T_camera_world @ before_estimate.T_camera_world,
-            covariance=moved.covariance + A @ before_estimate.covariance @ A.T,
+        T_camera_world, covariance = compounded(
+            (before_estimate.T_camera_world, before_estimate.covariance),
+            (moved.T_camera_world, moved.covariance),
         )
+        return replace(moved, T_camera_world=T_camera_world, covariance=covariance)
 
     def _corners(self, frame: StereoFrame, images: Images) -> Features:
         """Return the corners of a frame outside of what is excluded; asked for twice of each."""

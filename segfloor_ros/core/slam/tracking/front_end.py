@@ -90,8 +90,7 @@ class FrontEnd:
         """Go on with a map whose drive was broken off."""
         # A robot that nobody sees goes three standard deviations at most.
         self.motion.resume(last, greatest_speed_mps(self._map.keyframes) / 3)
-        seen = self._map.keyframes[-1].point_id
-        self.local.move_to(seen[seen != NO_POINT], last.T_camera_world)
+        self.local.move_to(self._map.keyframes[-1].seen_ids, last.T_camera_world)
 
     def search_near(self, T_world_camera: Array, reach: tuple[float, float]) -> None:
         """Look for the camera around a pose (4, 4) alone, unless it is tracked there."""
@@ -185,7 +184,16 @@ class FrontEnd:
             found = self._relocalise(images, features, frame.stamp_ns)
         found = self._stepped(frame, images) if found is None else found
         is_lost = self.motion.state.is_lost and found is not None
-        return None if is_lost and not _has_reached(self, found, frame.stamp_ns) else found
+        return None if is_lost and not self._has_reached(found, frame.stamp_ns) else found
+
+    def _has_reached(self, track: Track | None, stamp_ns: int) -> bool:
+        """Whether a camera that was lost can have driven to a pose since its last frame."""
+        seen_ns = self.frame_to_frame.stamp_ns
+        if track is None or seen_ns is None:
+            return True
+        way_m = greatest_speed_mps(self._map.keyframes) * 1e-9 * (stamp_ns - seen_ns)
+        step = track.T_camera_world @ invert(self.motion.T_camera_world)
+        return is_within(step, (SAME[0] + way_m, math.inf))
 
     def _standing(
         self, images: Images, features: Features, found: Track, expected: PoseEstimate
@@ -341,16 +349,6 @@ def _with_prior(sparse_map: SparseMap, track: Track, prior: PoseEstimate) -> Pos
     start, camera = by_images.T_camera_world, sparse_map.rig.camera
     found = refine_pose(camera, start, points, seen, prior, is_noise_known=True)
     return replace(by_images, T_camera_world=found.T_camera_world, covariance=found.covariance)
-
-
-def _has_reached(front_end: FrontEnd, track: Track | None, stamp_ns: int) -> bool:
-    """Whether a camera that was lost can have driven to a pose since its last frame."""
-    seen_ns = front_end.frame_to_frame.stamp_ns
-    if track is None or seen_ns is None:
-        return True
-    way_m = greatest_speed_mps(front_end._map.keyframes) * 1e-9 * (stamp_ns - seen_ns)
-    step = track.T_camera_world @ invert(front_end.motion.T_camera_world)
-    return is_within(step, (SAME[0] + way_m, math.inf))
 
 
 def is_near(T_camera_world: Array, expected: PoseEstimate | None) -> bool:

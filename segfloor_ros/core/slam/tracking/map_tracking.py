@@ -310,7 +310,7 @@ class LocalMap:
         """Whether a frame shows enough that is new. frames_since, since_ns: since the last one."""
         covisible = self._covisible(track.point_ids)
         reference = self._map.keyframes[covisible[0][0]]
-        known = reference.point_id[reference.point_id != NO_POINT]
+        known = reference.seen_ids
         reliable = known[self._map.observer_count[known] > 1]
         depth_m = self._median_depth(reliable if len(reliable) else known, track.T_camera_world)
         novelty = view_novelty(self._map, track.point_ids, track.T_camera_world, depth_m, covisible)
@@ -340,8 +340,7 @@ class LocalMap:
     def _median_depth(self, ids: NDArray[np.int32], T_camera_world: Array) -> float:
         """Return the depth of points `ids` (N,); without any, that of those seen last."""
         if len(ids):
-            depth = transform_points(T_camera_world, self._map.xyz_world[ids])[:, 2]
-            self._depth_m = max(float(np.median(depth)), MIN_DEPTH_M)
+            self._depth_m = self._map.median_depth_m(ids, T_camera_world)
         return self._depth_m
 
 
