@@ -21,14 +21,12 @@ from segfloor_ros.core.contracts import (
 )
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.rig import Rig
+from segfloor_ros.core.slam.thresholds import SEARCHED_FRAMES
 from segfloor_ros.core.slam.tracking.track import Track
 from segfloor_ros.core.twists import adjoint
 
 NOT_RECOGNISED = 'mapped, but no place of the map was recognised'
 NOTHING_SEEN = 'too few known points in view'
-
-MOST_LOOKED_BACK = 100
-"""Of the frames of a camera that is looked for, so many may turn out to have seen where it was."""
 
 MAX_HELD_KEYFRAMES = 50
 """Keyframes that wait with their images; of more, every second one goes without."""
@@ -91,14 +89,14 @@ class HeldResults:
     def take(self, result: FrameResult) -> list[FrameResult]:
         """Take in the next result and return what is ready: nothing while it is of a submap."""
         self._held.append(result)
-        self._lost = [] if result.tracked else [*self._lost[-MOST_LOOKED_BACK:], result]
+        self._lost = [] if result.tracked else [*self._lost[-SEARCHED_FRAMES:], result]
         self._thin_out()
         return [] if result.in_submap else self.release()
 
     def change(self, change: Callable[[FrameResult], FrameResult]) -> None:
         """Change the results that are held; those that are lost then may be recognised later."""
         self._held = [change(result) for result in self._held]
-        self._lost = [result for result in self._held if not result.tracked][-MOST_LOOKED_BACK:]
+        self._lost = [result for result in self._held if not result.tracked][-SEARCHED_FRAMES:]
 
     def recognise(self, proof: Mapping[int, Track], T_world_odom: Array) -> None:
         """Release the frames once more that were lost when the camera was looked for, from the
@@ -175,9 +173,7 @@ def in_map(result: FrameResult, T_map_world: Array) -> FrameResult:
 def _covariance_of_base(result: FrameResult, T_base_left: Array) -> Array:
     """Carry the covariance of the camera twist to the base, in odom axes."""
     T_odom_base = T_base_left @ result.T_odom_base @ invert(T_base_left)
-    axes = np.zeros((6, 6))
-    axes[:3, :3] = axes[3:, 3:] = T_odom_base[:3, :3]
-    A = axes @ adjoint(T_base_left)
+    A = np.kron(np.eye(2), T_odom_base[:3, :3]) @ adjoint(T_base_left)
     return A @ result.covariance @ A.T
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from segfloor_ros.core.contracts import NO_POINT, RelativeMotion, Up
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.rig import MIN_DEPTH_M, Observations, Rig
-from segfloor_ros.core.slam.thresholds import PROOF
+from segfloor_ros.core.slam.thresholds import FOUND_SHARE, PROOF
 from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.patch_alignment import SIDE_PX
 
@@ -515,12 +515,12 @@ class SparseMap:
         self.edges.point[:] = new_row[self.edges.point]
         return len(kept)
 
-    def poor_points(self, settled_before: int, min_found_ratio: float) -> NDArray[np.intp]:
+    def poor_points(self, settled_before: int) -> NDArray[np.intp]:
         """Return ids of points that tracking seldom finds, that are gone, or that only one keyframe
         saw although made before keyframe `settled_before`.
         """
         found = self.points['found_count']
-        seldom = found < min_found_ratio * self.points['visible_count']
+        seldom = found < FOUND_SHARE * self.points['visible_count']
         seldom |= self.points['seen_through_count'] >= PROOF
         lonely = (self.points['born'] < settled_before) & (self.observer_count < 2)
         return np.flatnonzero(self.alive & (seldom | lonely))

@@ -109,13 +109,14 @@ def test_a_place_seen_before_features_were_forgotten_merges_no_points():
     np.testing.assert_array_equal(first.point_id, [0, 1, 2])
 
 
-def test_points_that_tracking_seldom_finds_are_poor():
+def test_points_that_tracking_seldom_finds_are_poor(monkeypatch):
     sparse_map, _, _ = two_keyframes()
     for _ in range(10):
         sparse_map.points.note_tracking(np.array([0, 1, 2]), np.array([1, 2]))
     # Point 0 was found once (when it was made) in eleven chances.
-    np.testing.assert_array_equal(sparse_map.poor_points(0, 0.25), [0])
-    np.testing.assert_array_equal(sparse_map.poor_points(0, 0.05), [])
+    np.testing.assert_array_equal(sparse_map.poor_points(0), [0])
+    monkeypatch.setattr('segfloor_ros.core.slam.sparse_map.FOUND_SHARE', 0.05)
+    np.testing.assert_array_equal(sparse_map.poor_points(0), [])
 
 
 def test_grows_beyond_its_first_buffer():

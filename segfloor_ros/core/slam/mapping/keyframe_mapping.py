@@ -37,9 +37,9 @@ from segfloor_ros.core.timing import timed
 MIN_DISPARITY_PX = 1.0
 """Less is known too badly, as a share of it, for a new point."""
 
-SETTLING_KEYFRAMES, MIN_FOUND_RATIO = 2, 0.25
-"""Within so many keyframes others must see a new point too, and in this share of the frames that
-should show it a point must be found (Mur-Artal et al., ORB-SLAM, 2015, section VI-B)."""
+SETTLING_KEYFRAMES = 2
+"""Within so many keyframes others must see a new point too (Mur-Artal et al., ORB-SLAM, 2015,
+section VI-B)."""
 
 MAX_OCTAVES_APART, CANDIDATES = 2.5, 4
 """Levels of the pyramid between two views of what may be one point, and points tried for each."""
@@ -175,7 +175,7 @@ class LocalMapper:
         outliers = ~result.inliers
         self._map.unlink(adjustment.edge_keyframe[outliers], adjustment.edge_row[outliers])
         settled = adjustment.newest - SETTLING_KEYFRAMES
-        self._map.remove_points(self._map.poor_points(settled, MIN_FOUND_RATIO))
+        self._map.remove_points(self._map.poor_points(settled))
         retire_redundant(self._map, adjustment.free)
         if adjustment.newest >= NEIGHBOURS:
             self._map.thin_out(self._map.keyframes[adjustment.newest - NEIGHBOURS])

@@ -33,7 +33,7 @@ from segfloor_ros.core.slam.places.evidence import OF_VIEW, PlaceEvidence, is_en
 from segfloor_ros.core.slam.places.views import COLUMNS, ROWS
 from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap, features_of
-from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, SAME
+from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, SAME, SEARCHED_FRAMES
 from segfloor_ros.core.slam.tracking.evidence import ENOUGH_EVIDENCE
 from segfloor_ros.core.slam.tracking.images import Features, hamming
 from segfloor_ros.core.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels, Tracker
@@ -51,9 +51,6 @@ carried at a walking pace.
 
 BEST_GROUPS = 2
 """Places tried with every frame; one more is tried in turn: words alone are not sure."""
-
-NARROW_SEARCHES = 100
-"""Frames for which only the neighbourhood of a given pose is searched: it may be wrong."""
 
 VIEW_REACH_M = 2.0
 """A view shows a place also from so far before or behind where a keyframe stands."""
@@ -348,7 +345,7 @@ class Relocaliser:
     def search_near(self, T_world_camera: Array, reach: tuple[float, float]) -> None:
         """Look around a pose (4, 4) alone, for some time or until the camera is found."""
         self._near = T_world_camera, reach
-        self._searches_left = NARROW_SEARCHES
+        self._searches_left = SEARCHED_FRAMES
 
     @property
     def is_narrow(self) -> bool:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.model import StereoCamera, is_disparity
+from segfloor_ros.core.camera.model import is_disparity
 from segfloor_ros.core.camera.pixels import Region, union
 from segfloor_ros.core.contracts import NO_POINT, BodySensors, LastPose, StereoFrame
 from segfloor_ros.core.geometry import Array, invert, transform_points
@@ -114,20 +114,23 @@ class FrontEnd:
     @timed
     def fault(self, frame: StereoFrame) -> str:
         """Return why a pair of images cannot be tracked, or ''."""
-        points = self._map.xyz_world[self.follower.seen_ids]
-        motion = self.motion
-        shift = partial(
-            expected_shift,
-            self._camera,
-            points,
-            motion.T_camera_world,
-            motion.predict(frame.stamp_ns),
-        )
+        shift = partial(self._expected_shift, frame.stamp_ns)
         frozen = self.repeats.is_frozen(frame.left, shift)
         fault = image_fault(frame.left, frame.left if is_disparity(frame.right) else frame.right)
         if frozen and not fault:
             return 'the image is again the one before although the camera was moving'
         return fault
+
+    def _expected_shift(self, stamp_ns: int) -> float:
+        """Return how far the points of the last frame should have moved in the picture since, in
+        image widths; 0 without points.
+        """
+        points = self._map.xyz_world[self.follower.seen_ids]
+        if len(points) == 0:
+            return 0.0
+        poses = self.motion.T_camera_world, self.motion.predict(stamp_ns)
+        then, now = (self._camera.project(transform_points(T, points))[:, :2] for T in poses)
+        return float(np.median(np.linalg.norm(now - then, axis=1))) / self._camera.width
 
     def track(self, frame: StereoFrame, images: Images, found: Track | None = None) -> Track | None:
         """Find the pose of a frame: from the one before, else by its features. found: where
@@ -169,7 +172,7 @@ class FrontEnd:
         """
         prediction = self.motion.predict(frame.stamp_ns)
         followed = self.follower.follow(images, self.local.point_ids, prediction)
-        if followed is not None and not is_proof(followed.evidence(expected)):
+        if followed is not None and not is_proof(followed.estimate.evidence(expected)):
             followed = None
         reach_px = math.inf if expected is None else self.local.reach_px(expected)
         if followed is not None and followed.fits(expected) and reach_px < WIDE_PX:
@@ -254,10 +257,17 @@ class FrontEnd:
         """Return a track with the likeliest pose by images and prior; that of the images where the
         prior contradicts it.
         """
-        prior = track.prior
-        if prior is None or differ(track.estimate, prior):
+        by_images, prior = track.estimate, track.prior
+        if prior is None or differ(by_images, prior):
             return replace(track, prior=None)
-        return replace(track, estimate=_with_prior(self._map, track, prior))
+        # As sure as the patches are.
+        seen = track.observations.without_offset(self._map.rig.offset.value_px)
+        seen = seen.with_noise_factor(by_images.noise_factor)
+        points, start = self._map.xyz_world[track.point_ids], by_images.T_camera_world
+        found = refine_pose(self._camera, start, points, seen, prior, is_noise_known=True)
+        pose, covariance = found.T_camera_world, found.covariance
+        weighed = replace(by_images, T_camera_world=pose, covariance=covariance)
+        return replace(track, estimate=weighed)
 
     def bridge(self, frame: StereoFrame, fault: str) -> None:
         """Go on without the images, where the sensors allow it."""
@@ -341,16 +351,6 @@ class FrontEnd:
         self.frames_since_keyframe, self.keyframe_ns = 0, keyframe.stamp_ns
 
 
-def _with_prior(sparse_map: SparseMap, track: Track, prior: PoseEstimate) -> PoseEstimate:
-    """Return the pose by what a track shows, as sure as its patches are, and a prior."""
-    by_images, points = track.estimate, sparse_map.xyz_world[track.point_ids]
-    seen = track.observations.without_offset(sparse_map.rig.offset.value_px)
-    seen = seen.with_noise_factor(by_images.noise_factor)
-    start, camera = by_images.T_camera_world, sparse_map.rig.camera
-    found = refine_pose(camera, start, points, seen, prior, is_noise_known=True)
-    return replace(by_images, T_camera_world=found.T_camera_world, covariance=found.covariance)
-
-
 def is_near(T_camera_world: Array, expected: PoseEstimate | None) -> bool:
     """Whether a camera can be at a pose (4, 4). expected: where it is, as far as that is known."""
     return expected is None or not differ(
@@ -371,16 +371,6 @@ def image_fault(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> str:
         if live.mean() < MOST:
             return f'{side} image incomplete: {1 - live.mean():.0%} of its rows are empty'
     return ''
-
-
-def expected_shift(camera: StereoCamera, points: Array, T_then: Array, T_now: Array) -> float:
-    """Return how far the picture of points (N, 3) should have moved between two poses
-    (T_camera_world, (4, 4)), in image widths; 0 without points.
-    """
-    if len(points) == 0:
-        return 0.0
-    then, now = (camera.project(transform_points(T, points))[:, :2] for T in (T_then, T_now))
-    return float(np.median(np.linalg.norm(now - then, axis=1))) / camera.width
 
 
 class RepeatCheck:

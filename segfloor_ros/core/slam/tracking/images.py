@@ -40,7 +40,6 @@ from segfloor_ros.core.timing import timed
 SIDE_PX = 11
 """Of the patch around a pixel: small enough to be flat, large enough to be distinct."""
 
-LEVELS = 3
 SMALL_WIDTH_PX = 320
 """Width of a shrunk image: for optical flow; half of it shows what moves, a quarter turns."""
 STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.05)
@@ -148,7 +147,6 @@ def follow_pixels(
         start,
         guess,
         winSize=(window_px, window_px),
-        maxLevel=LEVELS,
         criteria=steps,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )

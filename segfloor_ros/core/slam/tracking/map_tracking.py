@@ -12,6 +12,7 @@ from keyframes: errors do not add up from frame to frame.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -101,6 +102,7 @@ class Tracker:
         if len(features) == 0 or len(local_ids) == 0:
             return None
         best: Track | None = None
+        most = -math.inf
         for start in starts:
             coarse = self._coarse(features, local_ids, start)
             if coarse is None:
@@ -108,13 +110,14 @@ class Tracker:
             track = self.track_at(images, features, local_ids, coarse.T_camera_world)
             if track is None:
                 continue
-            proven = is_proof(track.evidence(expected))
+            evidence = track.estimate.evidence(expected)
+            proven = is_proof(evidence)
             is_found_again = best is not None and proven and track.fits(best.estimate)
-            if best is None or track.evidence(expected) > best.evidence(expected):
-                best = track
+            if evidence > most:
+                best, most = track, evidence
             if is_found_again or (start.is_sure and proven and track.fits(expected)):
                 break
-        return best if best is not None and is_proof(best.evidence(expected)) else None
+        return best if is_proof(most) else None
 
     @timed
     def track_at(

@@ -40,8 +40,8 @@ GREY_NOISE = 2.0
 """Standard deviation of a grey level that the camera alone explains; a lower residual is luck, and
 an image that varies by less shows nothing."""
 
-ALIGNED_PX, MAX_SHIFT_STEP_PX = 2.0, 1.0
-"""From so far away a patch is brought to where it lies, by no more than this in one step."""
+ALIGNED_PX = 2.0
+"""From so far away a patch is brought to where it lies, by no more than half of it in one step."""
 
 MIN_SIGMA_PIXEL, MIN_SIGMA_DISPARITY = 0.15, 0.1
 """No patch is measured better: lenses, rectification and the shape of things are not perfect."""
@@ -52,7 +52,7 @@ MIN_TEXTURE = 5
 MIN_CORRELATION = 0.7
 """Of the patches of one point in both images."""
 
-MAX_STEP = np.array([MAX_SHIFT_STEP_PX, AFFINE_SIGMA, AFFINE_SIGMA])[:, None]
+MAX_STEP = np.array([ALIGNED_PX / 2, AFFINE_SIGMA, AFFINE_SIGMA])[:, None]
 
 Patches = NDArray[np.float32]
 

@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import UNKNOWN_COVARIANCE
 from segfloor_ros.core.geometry import Array, invert, make_transform, transform_points
-from segfloor_ros.core.least_squares import SHRINK, minimise
+from segfloor_ros.core.least_squares import SHRINK, SMALLEST, minimise
 from segfloor_ros.core.slam.rig import (
     MAX_DISPARITY_SHARE,
     MIN_DEPTH_M,
     SAME_PX,
-    SMALLEST,
     Observations,
     huber_cost,
     huber_weights,
