@@ -117,6 +117,7 @@ class KnownMap:
         self._relocaliser = Relocaliser(self._map, self._places)
         self._matcher = KnownPlaces(own, self._map, self._places)
         self._floors = FloorIndex(self._map.keyframes)
+        self._matches: list[Match] = []
 
     @property
     def num_keyframes(self) -> int:
@@ -134,7 +135,9 @@ class KnownMap:
         by_look = self._matcher.look(keyframe, images, anywhere, ~anywhere)
         found += [by_look] if by_look else []
         seen = self._matcher.best(keyframe, found, self._travel)
-        return self._matcher.add(None if seen is None or seen[1].objection else seen)
+        seen = None if seen is None or seen[1].objection else seen
+        self._matches = self._matcher.sightings.add(seen)
+        return bool(self._matches)
 
     def _travel(self, match: Match) -> float:
         """Return how likely the robot is at a match: at any place that it can have come to."""
@@ -165,7 +168,7 @@ class KnownMap:
         """Merge the drive's own map into the known one, with the same ids and stamps. Returns the
         words of all keyframes.
         """
-        matches = self._matcher.matches
+        matches = self._matches
         latest, own_ids = matches[-1], [self._own_ids(match) for match in matches]
         T_known_own = invert(drift(self._own, latest))
         before = len(self._map.keyframes)

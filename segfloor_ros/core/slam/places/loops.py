@@ -84,7 +84,7 @@ class LoopDetector:
 
     def reset(self) -> None:
         """Believe in no loop."""
-        self._matcher.reset()
+        self._matcher.sightings.reset()
 
     def detect(self, keyframe: KeyframeRecord, images: Pixels) -> list[Match]:
         """Return the keyframes that see a place again, once there are enough of them, else none."""
@@ -102,11 +102,7 @@ class LoopDetector:
             objection = 'no drift' if is_no_drift(keyframe, seen[0]) else seen[1].objection
             self._note(seen[0], objection or 'seen')
             seen = None if objection else seen
-        if not self._matcher.add(seen):
-            return []
-        matches = self._matcher.matches
-        self.reset()
-        return matches
+        return self._matcher.sightings.add(seen)
 
     def _note(self, match: Match, verdict: str) -> None:
         place = self._map.keyframes[match.place]
@@ -173,8 +169,8 @@ def is_no_drift(keyframe: KeyframeRecord, match: Match) -> bool:
 
 
 class PlaceMatcher:
-    """Matches keyframes with the places of a known map, which may be their own, until enough of
-    them agree.
+    """Matches keyframes with the places of a known map, which may be their own. sightings: those
+    that agree so far.
     """
 
     def __init__(self, own: SparseMap, known: SparseMap, places: PlaceRecognition) -> None:
@@ -182,16 +178,7 @@ class PlaceMatcher:
         self._camera = own.rig.camera
         self._known = known
         self._places = places
-        self._sightings: Sightings[Match] = Sightings(self.agree, self._newness)
-
-    def reset(self) -> None:
-        """Believe in no place."""
-        self._sightings.reset()
-
-    @property
-    def matches(self) -> list[Match]:
-        """The keyframes that see the place, the latest last."""
-        return self._sightings.views
+        self.sightings: Sightings[Match] = Sightings(self.agree, self._newness)
 
     def look(
         self,
@@ -205,8 +192,9 @@ class PlaceMatcher:
         """
         own_ids, track = self._known.points_of(np.flatnonzero(near)), None
         features = features_of(self._map, keyframe)
-        if self.matches:
-            pose = keyframe.T_camera_world @ drift(self._map, self.matches[-1])
+        before = self.sightings.views
+        if before:
+            pose = keyframe.T_camera_world @ drift(self._map, before[-1])
             depth_m = self._map.median_depth_m(keyframe.seen_ids, keyframe.T_camera_world)
             around = views_near(self._known, pose, depth_m, len(may_show))
             ids = self._places.points_of(around[may_show[around]][:NEIGHBOURS], own_ids)
@@ -267,10 +255,6 @@ class PlaceMatcher:
             travel=travel,
             level=self.level(match),
         )
-
-    def add(self, seen: tuple[Match, PlaceEvidence] | None) -> bool:
-        """Take in what the next keyframe sees of the place; returns whether that is enough."""
-        return self._sightings.add(seen)
 
     def _newness(self, matches: list[Match]) -> list[float]:
         """Return how new the view of each keyframe is to those before it."""

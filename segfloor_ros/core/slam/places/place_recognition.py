@@ -315,15 +315,19 @@ class Sightings(Generic[View]):
         """The views, the latest last."""
         return [view for view, _ in self._seen]
 
-    def add(self, seen: tuple[View, PlaceEvidence] | None) -> bool:
-        """Take in the next view and what it says, None for one that does not see the place; returns
-        whether it is proven.
+    def add(self, seen: tuple[View, PlaceEvidence] | None) -> list[View]:
+        """Take in the next view and what it says, None for one that does not see the place. Returns
+        the views, once, when they prove the place, the latest last, else none.
         """
         if seen is None:
             self._seen = self._seen[1:]
-            return False
+            return []
         self._seen = [*(before for before in self._seen if self._agree(before[0], seen[0])), seen]
-        return is_enough([evidence for _, evidence in self._seen], self._newness(self.views))
+        views = self.views
+        if not is_enough([evidence for _, evidence in self._seen], self._newness(views)):
+            return []
+        self.reset()
+        return views
 
 
 class Relocaliser:
@@ -381,9 +385,9 @@ class Relocaliser:
         # Where it is expected, no other place can be meant.
         travel = ENOUGH_EVIDENCE if is_expected or given is not None else 0.0
         evidence = PlaceEvidence(look=self._places.log_ratio(found), travel=travel)
-        if not self._sightings.add(((stamp_ns, found), evidence)):
+        views = self._sightings.add(((stamp_ns, found), evidence))
+        if not views:
             return None
-        views = self._sightings.views
         self.reset()
         self._proof = dict(views)
         return found
