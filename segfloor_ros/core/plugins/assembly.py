@@ -12,6 +12,7 @@ from segfloor_ros.core.pipeline import KeyframeListener, KeyframeStages, Pipelin
 from segfloor_ros.core.plugins.maps.session import MapSession
 from segfloor_ros.core.plugins.moving.moving_regions import MovingRegions
 from segfloor_ros.core.plugins.rig.check import RigCheck
+from segfloor_ros.core.plugins.semantics.late_masks import LateMasks
 from segfloor_ros.core.plugins.semantics.network import ImageLabeller
 from segfloor_ros.core.plugins.semantics.semantic_map import SemanticMap
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
@@ -76,6 +77,7 @@ def equipped_slam(
         BodyMotion(),
         RigCheck(camera),
         MapSession,
+        LateMasks,
     )
     return StereoSlam(camera, settings, mount, meter, times, background, plugins)
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.core.camera.pixels import Region
 from segfloor_ros.core.contracts import (
     BodySensors,
     InputFault,
@@ -31,6 +32,8 @@ from segfloor_ros.core.contracts import (
 )
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.slam.session import OneMap, Parts
+from segfloor_ros.core.slam.sparse_map import SparseMap
+from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 
 logger = logging.getLogger(__name__)
 
@@ -57,6 +60,19 @@ class NothingMoves:
 
     def reset(self) -> None:
         """Have nothing to forget."""
+
+
+class NoLateMasks:
+    """No masks come once a keyframe is made."""
+
+    def __init__(self, front_end: FrontEnd, sparse_map: SparseMap, dilation_px: int) -> None:
+        """Need none of it."""
+
+    def add(self, stamp_ns: int, mask: Region) -> None:
+        """Ignore a mask (H, W) of a keyframe."""
+
+    def take_points_back(self) -> None:
+        """Have none to remove."""
 
 
 class NoSensors:
@@ -140,3 +156,4 @@ class Plugins:
     sensors: BodySensors = field(default_factory=NoSensors)
     rig_check: RigCheck = field(default_factory=TrustedRig)
     session: Callable[[Parts], OneMap] = OneMap
+    late_masks: Callable[[FrontEnd, SparseMap, int], NoLateMasks] = NoLateMasks

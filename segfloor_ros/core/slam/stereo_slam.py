@@ -10,7 +10,6 @@ import numpy as np
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.camera.pixels import BlankBorder, Region
 from segfloor_ros.core.contracts import (
-    NO_POINT,
     UNKNOWN_COVARIANCE,
     FrameResult,
     Keyframe,
@@ -27,13 +26,13 @@ from segfloor_ros.core.slam.mapping.back_end import BackEnd
 from segfloor_ros.core.slam.mount_search import MountMeter, MountSearch
 from segfloor_ros.core.slam.optional import Plugins
 from segfloor_ros.core.slam.places.views import GroundViews
-from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, Rig
+from segfloor_ros.core.slam.rig import Rig
 from segfloor_ros.core.slam.session import Parts, SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.snapshot import take_snapshot
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
-from segfloor_ros.core.slam.tracking.images import Images, dilate, is_inside
+from segfloor_ros.core.slam.tracking.images import Images
 from segfloor_ros.core.slam.tracking.patch_alignment import sample_patches
 from segfloor_ros.core.slam.tracking.track import Track
 from segfloor_ros.core.timing import StageTimes
@@ -41,37 +40,6 @@ from segfloor_ros.core.timing import StageTimes
 REPEATED = 'tracking: the image is the one before; the motion is taken to go on'
 UNSURE_M = 0.005
 """A place that the images leave more uncertain than this is said to be."""
-
-
-class LateMasks:
-    """Takes back the points of keyframes where masks that come later show what moves."""
-
-    def __init__(self, front_end: FrontEnd, sparse_map: SparseMap, dilation_px: int) -> None:
-        self._front_end, self._map, self._dilation_px = front_end, sparse_map, dilation_px
-        self._masks: list[tuple[KeyframeRecord, Region]] = []
-
-    def add(self, stamp_ns: int, mask: Region) -> None:
-        """Take in a mask (H, W) of the left image of a keyframe, 255 where something moves, for
-        the next frame. A stamp of no keyframe says nothing.
-        """
-        recent = self._map.keyframes[-LOCAL_KEYFRAMES:]  # others hardly change any more
-        keyframe = next((k for k in recent if k.stamp_ns == stamp_ns), None)
-        if keyframe is not None and not self._front_end.is_fixed:
-            self._masks.append((keyframe, dilate(mask, self._dilation_px)))
-
-    def take_points_back(self) -> None:
-        """Remove the points; while nothing is being adjusted."""
-        for keyframe, mask in self._masks:
-            if keyframe.index >= len(self._map.keyframes):
-                continue
-            if self._map.keyframes[keyframe.index] is not keyframe:
-                continue  # of a submap that was given up or merged
-            ids = keyframe.point_id[is_inside(mask, keyframe.observations.uvd_px[:, :2])]
-            ids = ids[ids != NO_POINT]
-            self._map.remove_points(ids[self._map.points['born'][ids] >= keyframe.index])
-        if self._masks:
-            self._masks.clear()
-            self._front_end.drop_dead()
 
 
 class StereoSlam:
@@ -121,7 +89,7 @@ class StereoSlam:
             Parts(self.map, self.front_end, self.back_end, self.sensors, self._moving, search, held)
         )
         self._shows_nothing = False
-        self.late_masks = LateMasks(self.front_end, self.map, settings.mask_dilation_px)
+        self.late_masks = plugins.late_masks(self.front_end, self.map, settings.mask_dilation_px)
         self.announce: Callable[[FrameResult, StereoFrame, Region | None], None] | None = None
 
     @property
