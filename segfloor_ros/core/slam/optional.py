@@ -1,8 +1,8 @@
 """What SLAM can do without: the null objects.
 
 Moving objects, wheels and IMU and the check of the rig have their protocols in `contracts`. Maps
-are kept, and mapped beside one another, by a session that does more than `OneMap`: with that a
-camera that gets lost is searched for in the only map there is.
+are loaded, saved and mapped beside one another by a session that does more than `OneMap`, which
+searches for a lost camera in the map of the drive alone.
 """
 
 from __future__ import annotations
