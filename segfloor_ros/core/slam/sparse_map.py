@@ -527,15 +527,10 @@ class SparseMap:
 
     def covisible(self, ids: NDArray[np.integer]) -> Covisible:
         """Return the keyframes that observe any of the points (N,)."""
-        shared = self.edges.count(self._are(ids))
+        shared = self.edges.count(_among(self, ids))
         order = np.lexsort((-np.arange(len(shared)), -shared))
         order = order[shared[order] > 0]
         return order, shared[order]
-
-    def median_depth_m(self, ids: NDArray[np.integer], T_camera_world: Array) -> float:
-        """Return the median depth of points (N,) before a camera."""
-        depth = transform_points(T_camera_world, self.xyz_world[ids])[:, 2]
-        return max(float(np.median(depth)), MIN_DEPTH_M) if len(ids) else MIN_DEPTH_M
 
     def points_of(self, keyframe_indices: NDArray[np.integer]) -> NDArray[np.int32]:
         """Return the ascending rows of all points that the keyframes observe."""
@@ -546,13 +541,20 @@ class SparseMap:
 
     def edges_of(self, ids: NDArray[np.integer]) -> Observers:
         """Return all observations of the points (N,)."""
-        return self.edges.to(self._are(ids))
+        return self.edges.to(_among(self, ids))
 
-    def _are(self, ids: NDArray[np.integer]) -> NDArray[np.bool_]:
-        """Return which points (P,) are among some (N,)."""
-        wanted = np.zeros(len(self.alive), bool)
-        wanted[ids] = True
-        return wanted
+
+def _among(sparse_map: SparseMap, ids: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Return which points (P,) of a map are among some (N,)."""
+    wanted = np.zeros(len(sparse_map.alive), bool)
+    wanted[ids] = True
+    return wanted
+
+
+def median_depth_m(sparse_map: SparseMap, ids: NDArray[np.integer], T_camera_world: Array) -> float:
+    """Return the median depth of points (N,) before a camera."""
+    depth = transform_points(T_camera_world, sparse_map.xyz_world[ids])[:, 2]
+    return max(float(np.median(depth)), MIN_DEPTH_M) if len(ids) else MIN_DEPTH_M
 
 
 def features_of(sparse_map: SparseMap, keyframe: KeyframeRecord) -> Features:

@@ -37,6 +37,7 @@ from segfloor_ros.core.slam.sparse_map import (
     SparseMap,
     features_of,
     loop_sigma,
+    median_depth_m,
 )
 from segfloor_ros.core.slam.thresholds import ENOUGH, PROOF
 from segfloor_ros.core.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels
@@ -195,7 +196,7 @@ class PlaceMatcher:
         before = self.sightings.views
         if before:
             pose = keyframe.T_camera_world @ drift(self._map, before[-1])
-            depth_m = self._map.median_depth_m(keyframe.seen_ids, keyframe.T_camera_world)
+            depth_m = median_depth_m(self._map, keyframe.seen_ids, keyframe.T_camera_world)
             around = views_near(self._known, pose, depth_m, len(may_show))
             ids = self._places.points_of(around[may_show[around]][:NEIGHBOURS], own_ids)
             track = self._places.confirm(images, features, ids, pose)
@@ -259,7 +260,7 @@ class PlaceMatcher:
     def _newness(self, matches: list[Match]) -> list[float]:
         """Return how new the view of each keyframe is to those before it."""
         latest = self._map.keyframes[matches[-1].keyframe]
-        depth_m = self._map.median_depth_m(latest.seen_ids, latest.T_camera_world)
+        depth_m = median_depth_m(self._map, latest.seen_ids, latest.T_camera_world)
         poses = np.stack([match.T_camera_world for match in matches])
         new = novelty(poses[:, None] @ invert(poses), depth_m)
         return [float(new[k, :k].min(initial=1.0)) for k in range(len(matches))]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from segfloor_ros.core.camera.model import is_disparity
 from segfloor_ros.core.camera.pixels import Region, union
 from segfloor_ros.core.contracts import NO_POINT, BodySensors, LastPose, StereoFrame
-from segfloor_ros.core.geometry import Array, invert, transform_points
+from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.slam.places.place_recognition import (
     PlaceRecognition,
     Relocaliser,
@@ -114,23 +114,15 @@ class FrontEnd:
     @timed
     def fault(self, frame: StereoFrame) -> str:
         """Return why a pair of images cannot be tracked, or ''."""
-        shift = partial(self._expected_shift, frame.stamp_ns)
-        frozen = self.repeats.is_frozen(frame.left, shift)
+        motion, follower = self.motion, self.follower
+        frozen = self.repeats.is_frozen(
+            frame.left,
+            lambda: follower.expected_shift(motion.T_camera_world, motion.predict(frame.stamp_ns)),
+        )
         fault = image_fault(frame.left, frame.left if is_disparity(frame.right) else frame.right)
         if frozen and not fault:
             return 'the image is again the one before although the camera was moving'
         return fault
-
-    def _expected_shift(self, stamp_ns: int) -> float:
-        """Return how far the points of the last frame should have moved in the picture since, in
-        image widths; 0 without points.
-        """
-        points = self._map.xyz_world[self.follower.seen_ids]
-        if len(points) == 0:
-            return 0.0
-        poses = self.motion.T_camera_world, self.motion.predict(stamp_ns)
-        then, now = (self._camera.project(transform_points(T, points))[:, :2] for T in poses)
-        return float(np.median(np.linalg.norm(now - then, axis=1))) / self._camera.width
 
     def track(self, frame: StereoFrame, images: Images, found: Track | None = None) -> Track | None:
         """Find the pose of a frame: from the one before, else by its features. found: where
@@ -186,17 +178,13 @@ class FrontEnd:
         if found is None and self.motion.state is not TrackingState.TRACKING:
             found = self._relocalise(images, features, frame.stamp_ns)
         found = self._stepped(frame, images) if found is None else found
-        is_lost = self.motion.state.is_lost and found is not None
-        return None if is_lost and not self._has_reached(found, frame.stamp_ns) else found
-
-    def _has_reached(self, track: Track | None, stamp_ns: int) -> bool:
-        """Whether a camera that was lost can have driven to a pose since its last frame."""
         seen_ns = self.frame_to_frame.stamp_ns
-        if track is None or seen_ns is None:
-            return True
-        way_m = greatest_speed_mps(self._map.keyframes) * 1e-9 * (stamp_ns - seen_ns)
-        step = track.T_camera_world @ invert(self.motion.T_camera_world)
-        return is_within(step, (SAME[0] + way_m, math.inf))
+        if found is not None and self.motion.state.is_lost and seen_ns is not None:
+            # No farther than a robot can have driven since its last frame.
+            way_m = greatest_speed_mps(self._map.keyframes) * 1e-9 * (frame.stamp_ns - seen_ns)
+            step = found.T_camera_world @ invert(self.motion.T_camera_world)
+            found = found if is_within(step, (SAME[0] + way_m, math.inf)) else None
+        return found
 
     def _standing(
         self, images: Images, features: Features, found: Track, expected: PoseEstimate

@@ -30,7 +30,7 @@ from segfloor_ros.core.slam.rig import (
     Observations,
     in_view,
 )
-from segfloor_ros.core.slam.sparse_map import Covisible, SparseMap
+from segfloor_ros.core.slam.sparse_map import Covisible, SparseMap, median_depth_m
 from segfloor_ros.core.slam.tracking.evidence import is_proof
 from segfloor_ros.core.slam.tracking.images import (
     PYRAMID_LEVELS,
@@ -343,7 +343,7 @@ class LocalMap:
     def _median_depth(self, ids: NDArray[np.int32], T_camera_world: Array) -> float:
         """Return the depth of points `ids` (N,); without any, that of those seen last."""
         if len(ids):
-            self._depth_m = self._map.median_depth_m(ids, T_camera_world)
+            self._depth_m = median_depth_m(self._map, ids, T_camera_world)
         return self._depth_m
 
 
@@ -372,7 +372,7 @@ def align_pixels(
 
 
 class Follower:
-    """Finds the pose of a frame from the one before."""
+    """Finds the pose of a frame from the one before. seen_ids: points (N,) that this one showed."""
 
     def __init__(self, sparse_map: SparseMap) -> None:
         self._map = sparse_map
@@ -383,27 +383,34 @@ class Follower:
     def reset(self) -> None:
         """Know no frame before."""
         self._small: NDArray[np.uint8] | None = None
-        self._ids: NDArray[np.int32] = np.zeros(0, np.int32)
+        self.seen_ids: NDArray[np.int32] = np.zeros(0, np.int32)
         self._uv_px: Array = np.zeros((0, 2))
 
     def see(self, images: Images, ids: NDArray[np.int32], uv_px: Array) -> None:
         """Take in a frame that shows map points `ids` (N,) at pixels (N, 2)."""
-        self._small, self._ids, self._uv_px = images.small, ids, uv_px
+        self._small, self.seen_ids, self._uv_px = images.small, ids, uv_px
 
-    @property
-    def seen_ids(self) -> NDArray[np.int32]:
-        """The points (N,) of the last frame."""
-        return self._ids
+    def expected_shift(self, T_then: Array, T_now: Array) -> float:
+        """Return how far the picture of these points should have moved between two poses
+        (T_camera_world, (4, 4)), in image widths; 0 without points.
+        """
+        points = self._map.xyz_world[self.seen_ids]
+        if len(points) == 0:
+            return 0.0
+        then, now = (
+            self._camera.project(transform_points(T, points))[:, :2] for T in (T_then, T_now)
+        )
+        return float(np.median(np.linalg.norm(now - then, axis=1))) / self._camera.width
 
     def drop_inside(self, region: Region) -> None:
         """Forget the points that the last frame shows in a region."""
         outside = ~is_inside(region, self._uv_px)
-        self._ids, self._uv_px = self._ids[outside], self._uv_px[outside]
+        self.seen_ids, self._uv_px = self.seen_ids[outside], self._uv_px[outside]
 
     def drop_dead(self) -> None:
         """Forget points that are not part of the map any more."""
-        alive = self._map.alive[self._ids]
-        self._ids, self._uv_px = self._ids[alive], self._uv_px[alive]
+        alive = self._map.alive[self.seen_ids]
+        self.seen_ids, self._uv_px = self.seen_ids[alive], self._uv_px[alive]
 
     def follow(
         self, images: Images, local_ids: NDArray[np.int32], T_predicted: Array
@@ -432,10 +439,10 @@ class Follower:
     @timed
     def _by_flow(self, images: Images, T_predicted: Array) -> PoseEstimate | None:
         """Find the pose to about a pixel from where the last frame's points went."""
-        if self._small is None or len(self._ids) == 0:
+        if self._small is None or len(self.seen_ids) == 0:
             return None
-        step = -(-len(self._ids) // MAX_FOLLOWED)
-        ids, uv_last = self._ids[::step], self._uv_px[::step]
+        step = -(-len(self.seen_ids) // MAX_FOLLOWED)
+        ids, uv_last = self.seen_ids[::step], self._uv_px[::step]
         points = transform_points(T_predicted, self._map.xyz_world[ids])
         front = points[:, 2] > MIN_DEPTH_M
         ids, uv_last, points = ids[front], uv_last[front], points[front]
