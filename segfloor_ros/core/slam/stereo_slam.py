@@ -78,7 +78,7 @@ class StereoSlam:
         self._times = times or StageTimes()
         self.sensors, self.rig_check = plugins.sensors, plugins.rig_check
         self.front_end = FrontEnd(settings, self.map, self.sensors)
-        self.back_end = BackEnd(settings, self.map, self.front_end, background)
+        self.back_end = BackEnd(self.map, self.front_end, background)
         self._ground = GroundViews(self.rig)
         self._border = BlankBorder()
         self._moving = plugins.moving

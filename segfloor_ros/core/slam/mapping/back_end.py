@@ -31,7 +31,6 @@ from segfloor_ros.core.slam.places.loop_closing import (
     plan_closing,
 )
 from segfloor_ros.core.slam.places.loops import Candidate, LoopDetector
-from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 from segfloor_ros.core.slam.tracking.images import Images
@@ -51,15 +50,8 @@ class BackEnd:
     timing. Tracking never waits for an adjustment of the whole map.
     """
 
-    def __init__(
-        self,
-        settings: StereoSlamSettings,
-        sparse_map: SparseMap,
-        front_end: FrontEnd,
-        background: bool,
-    ) -> None:
+    def __init__(self, sparse_map: SparseMap, front_end: FrontEnd, background: bool) -> None:
         self._front_end = front_end
-        self._longest_frames = settings.keyframe_max_frames
         self.mapper = LocalMapper(sparse_map)
         self.places = front_end.places
         self.loop_count = 0

@@ -223,7 +223,7 @@ def closing_loops(closed, monkeypatch, background):
     sparse_map, none = SparseMap(closed[0].rig), np.zeros(0, np.int32)
     fill_map(sparse_map, map_to_arrays(closed[0].map))
     front_end = FrontEnd(SETTINGS, sparse_map, BodyMotion())
-    mapping = back_end.BackEnd(SETTINGS, sparse_map, front_end, background)
+    mapping = back_end.BackEnd(sparse_map, front_end, background)
     last = sparse_map.keyframes[-1]
 
     def close(off_m):
