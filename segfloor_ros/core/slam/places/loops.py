@@ -287,7 +287,7 @@ class PlaceMatcher:
 
     def around(self, match: Match) -> float:
         """Return how much likelier what stands around the keyframe stands where the known map has
-        it than in a place beside, in nats: no limit to what is seen within one map.
+        it than in a place beside, in nats; infinite within one map, where it is not compared.
         """
         return np.inf
 
