@@ -15,9 +15,6 @@ CHANCE_SHARE = 0.1
 """Share of the points of a view of which no more may be found by chance: far ones alone fit many
 places."""
 
-MOST = 0.6
-"""Share of what was followed that must be left of it."""
-
 NEARLY_ALL = 0.9
 """Share of a keyframe's points that others must see as well, or of a view that they must cover, for
 it to add nothing (Mur-Artal et al., ORB-SLAM, IEEE T-RO 2015, section VI-E); and what counts as

@@ -26,7 +26,7 @@ from segfloor_ros.core.slam.places.place_recognition import (
 from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
-from segfloor_ros.core.slam.thresholds import MOST, SAME
+from segfloor_ros.core.slam.thresholds import SAME
 from segfloor_ros.core.slam.tracking.evidence import is_proof
 from segfloor_ros.core.slam.tracking.frame_to_frame import FrameToFrame
 from segfloor_ros.core.slam.tracking.images import FeatureExtractor, Features, Images, is_inside
@@ -43,6 +43,9 @@ from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ, refine_pose
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
+
+LIVE_ROWS = 0.6
+"""Share of the rows of an image that must show something: others were not delivered."""
 
 MIN_EXPECTED_SHIFT = 0.004
 """Motion of the picture, in widths per frame, that cannot stop from one frame to the next."""
@@ -356,7 +359,7 @@ def image_fault(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> str:
         if spread < GREY_NOISE:
             return f'{side} image without contrast (mean grey level {mean:.0f})'
         live = (sampled != sampled[:, :1]).any(axis=1)
-        if live.mean() < MOST:
+        if live.mean() < LIVE_ROWS:
             return f'{side} image incomplete: {1 - live.mean():.0%} of its rows are empty'
     return ''
 
