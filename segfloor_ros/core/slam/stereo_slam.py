@@ -73,8 +73,7 @@ class StereoSlam:
         self.rig = Rig(camera, mount)
         self.map = SparseMap(self.rig)
         self.sessions: list[dict[str, int]] = []
-        self._camera = camera
-        self._settings = settings
+        self._mask_dilation_px = settings.mask_dilation_px
         self._times = times or StageTimes()
         self.sensors, self.rig_check = plugins.sensors, plugins.rig_check
         self.front_end = FrontEnd(settings, self.map, self.sensors)
@@ -83,13 +82,13 @@ class StereoSlam:
         self._border = BlankBorder()
         self._moving = plugins.moving
         held = HeldResults(self.rig)
-        self._mount_search = MountSearch(self.rig, mount_meter, self.sensors, held)
-        search = self._mount_search
+        search = MountSearch(self.rig, mount_meter, self.sensors, held)
+        self._mount_search = search
         self.session = plugins.session(
             Parts(self.map, self.front_end, self.back_end, self.sensors, self._moving, search, held)
         )
         self._shows_nothing = False
-        self.late_masks = plugins.late_masks(self.front_end, self.map, settings.mask_dilation_px)
+        self.late_masks = plugins.late_masks(self.front_end, self.map, self._mask_dilation_px)
         self.announce: Callable[[FrameResult, StereoFrame, Region | None], None] | None = None
 
     @property
@@ -188,7 +187,7 @@ class StereoSlam:
             self.rig_check.watch(frame, float(rotation_angle(turned[:3, :3])))
             frame = self.rig_check.corrected(frame)
         border = self._border.see(frame.left)
-        return frame, Images.of(frame, self._camera, border, self._settings.mask_dilation_px)
+        return frame, Images.of(frame, self.rig.camera, border, self._mask_dilation_px)
 
     def _track(self, frame: StereoFrame, images: Images, fault: str) -> Track | None:
         """Find the pose of a frame in the map; by sensors, or by a search, where that fails."""

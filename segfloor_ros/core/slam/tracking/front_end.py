@@ -69,7 +69,6 @@ class FrontEnd:
         self.places = PlaceRecognition(sparse_map)
         self.is_fixed = False
         self.frames_since_keyframe = self.keyframe_ns = 0
-        self._camera = sparse_map.rig.camera
         self._map = sparse_map
         self.relocaliser = Relocaliser(sparse_map, self.places)
         self.repeats = RepeatCheck()
@@ -252,10 +251,11 @@ class FrontEnd:
         if prior is None or differ(by_images, prior):
             return replace(track, prior=None)
         # As sure as the patches are.
-        seen = track.observations.without_offset(self._map.rig.offset.value_px)
+        rig = self._map.rig
+        seen = track.observations.without_offset(rig.offset.value_px)
         seen = seen.with_noise_factor(by_images.noise_factor)
         points, start = self._map.xyz_world[track.point_ids], by_images.T_camera_world
-        found = refine_pose(self._camera, start, points, seen, prior, is_noise_known=True)
+        found = refine_pose(rig.camera, start, points, seen, prior, is_noise_known=True)
         pose, covariance = found.T_camera_world, found.covariance
         weighed = replace(by_images, T_camera_world=pose, covariance=covariance)
         return replace(track, estimate=weighed)
