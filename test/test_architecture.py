@@ -41,12 +41,12 @@ STAGES = ('slam', 'floor', 'cloud', 'grid')
 
 CEILINGS = {
     'core.pipeline': 9975,
-    'core.slam.stereo_slam': 6375,
+    'core.slam.stereo_slam': 6050,
     'core.floor.segmentation': 3065,
     'core.cloud': 750,
     'core.grid.mapper': 1400,
     'nodes.stereo_camera': 3750,
-    'nodes.stereo_slam': 10225,
+    'nodes.stereo_slam': 9900,
     'nodes.floor_segmentation': 5265,
     'nodes.cloud_labelling': 3050,
     'nodes.occupancy_grid': 3400,

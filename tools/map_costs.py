@@ -28,7 +28,7 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     move_keyframes,
     solve_global,
 )
-from segfloor_ros.core.slam.places.loop_closing import plan_closing, solve_closing
+from segfloor_ros.core.slam.places.loop_closing import optimise, plan_closing
 from segfloor_ros.core.slam.places.loops import path_lengths
 from segfloor_ros.core.slam.places.place_recognition import NUM_WORDS, PlaceRecognition, Vocabulary
 from segfloor_ros.core.slam.rig import NO_OFFSET, Rig
@@ -129,7 +129,7 @@ def measure(count: int) -> dict[str, float]:
     bend(sparse_map)
     match = _loop(sparse_map, count)
     own['plan'], closing = once_ms(lambda: plan_closing(sparse_map, [match]))
-    own['pose graph'], (poses, _) = once_ms(lambda: solve_closing(closing))
+    own['pose graph'], (poses, _) = once_ms(lambda: optimise(closing.graph))
     own['move'], _ = once_ms(lambda: move_keyframes(sparse_map, poses))
     own['copy'], adjustment = once_ms(lambda: copy_map(sparse_map, NO_OFFSET, None))
     own['global'], result = once_ms(lambda: solve_global(CAMERA, adjustment, lambda: True))

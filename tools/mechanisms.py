@@ -124,12 +124,12 @@ SLAM: dict[str, Mechanism] = {
         {'core.slam.places.place_recognition.is_enough': lambda *_: True}
     ),
     'what stands around a place': Mechanism(
-        {'core.slam.places.loops.PlaceMatcher.around': lambda *_: np.inf}
+        {'core.plugins.maps.known_map.KnownPlaces.around': lambda *_: np.inf}
     ),
     'other places that a view fits': Mechanism(
         {'core.slam.places.loops.PlaceMatcher.agree': lambda *_: True}
     ),
-    'map parts': Mechanism({'core.slam.session.LOST_NS': 1 << 62}),
+    'map parts': Mechanism({'core.plugins.maps.session.LOST_NS': 1 << 62}),
     'two motions distinguished': Mechanism({'core.slam.tracking.pose.differ': lambda a, b: False}),
     'motion so far': Mechanism({'core.slam.tracking.front_end.FrontEnd._standing': _found}),
     'noise of a motion that goes on': Mechanism(
@@ -154,7 +154,7 @@ SLAM: dict[str, Mechanism] = {
     'offset of the camera once it is known': Mechanism(
         {'core.plugins.sensors.wheel_odometry.KNOWN_M': np.inf}
     ),
-    'begin again': Mechanism({'core.slam.session.HARDLY_BEGUN': -1}),
+    'begin again': Mechanism({'core.plugins.maps.session.HARDLY_BEGUN': -1}),
     'scene flow': Mechanism({'core.plugins.moving.scene_flow.SceneFlow._earlier': lambda *_: []}),
     'points seen through': Mechanism({'core.slam.sparse_map.PROOF': 1 << 30}),
     'search for what moves': Mechanism(settings={'detect_moving': False}),

@@ -14,7 +14,8 @@ from typing import Protocol, TypeVar
 S = TypeVar('S', bound='State')
 
 SMALLEST = 1e-12
-"""Decrease of a cost that is rounding alone."""
+"""Decrease of a cost that is rounding alone; variance or pivot: what is not observed must not look
+exact, nor end in a division by zero."""
 
 SHRINK, GROW = 0.2, 10.0
 """Factors of the damping after a step that lowers the cost, unless the problem knows a better one,

@@ -10,6 +10,9 @@ import numpy as np
 
 from segfloor_ros.core.geometry import Array, make_transform, quaternions_of, rotation_angle
 
+Uncertain = tuple[Array, Array]
+"""A transform (4, 4), and the covariance (6, 6) of the twist before it."""
+
 
 def skew(v: Array) -> Array:
     """Return the cross-product matrices (..., 3, 3) of vectors (..., 3)."""
@@ -83,6 +86,15 @@ def adjoint(T: Array) -> Array:
     matrix[..., :3, :3] = matrix[..., 3:, 3:] = R
     matrix[..., :3, 3:] = skew(t) @ R
     return matrix
+
+
+def compounded(before: Uncertain, motion: Uncertain) -> Uncertain:
+    """Return a pose (4, 4) and its covariance (6, 6) after a motion (Barfoot 2017, section 7.3.3,
+    to second order).
+    """
+    (T_before, of_before), (T_motion, of_motion) = before, motion
+    A = adjoint(T_motion)
+    return T_motion @ T_before, A @ of_before @ A.T + of_motion
 
 
 def se3_logs(T: Array) -> Array:

@@ -9,13 +9,15 @@ from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.floor.plane.mount import MountEstimator
 from segfloor_ros.core.pipeline import KeyframeListener, KeyframeStages, Pipeline
-from segfloor_ros.core.plugins.maps.known_map import SubmapKeeper
+from segfloor_ros.core.plugins.maps.session import MapSession
 from segfloor_ros.core.plugins.moving.moving_regions import MovingRegions
 from segfloor_ros.core.plugins.rig.check import RigCheck
+from segfloor_ros.core.plugins.semantics.late_masks import LateMasks
 from segfloor_ros.core.plugins.semantics.network import ImageLabeller
 from segfloor_ros.core.plugins.semantics.semantic_map import SemanticMap
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
-from segfloor_ros.core.slam.optional import MountMeter, NothingMoves, Plugins
+from segfloor_ros.core.slam.mount_search import MountMeter
+from segfloor_ros.core.slam.optional import NothingMoves, Plugins
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE, StereoSlam
 from segfloor_ros.core.timing import StageTimes
@@ -74,7 +76,8 @@ def equipped_slam(
         MovingRegions(camera) if settings.detect_moving else NothingMoves(),
         BodyMotion(),
         RigCheck(camera),
-        SubmapKeeper(),
+        MapSession,
+        LateMasks,
     )
     return StereoSlam(camera, settings, mount, meter, times, background, plugins)
 

@@ -20,16 +20,13 @@ from segfloor_ros.core.contracts import (
     MovingPoints,
 )
 from segfloor_ros.core.geometry import Array, invert, transform_points
+from segfloor_ros.core.slam.rig import Rig
+from segfloor_ros.core.slam.thresholds import SEARCHED_FRAMES
 from segfloor_ros.core.slam.tracking.track import Track
 from segfloor_ros.core.twists import adjoint
 
 NOT_RECOGNISED = 'mapped, but no place of the map was recognised'
 NOTHING_SEEN = 'too few known points in view'
-BEFORE_RECOGNITION = ', mapped before the map was recognised'
-OUTSIDE_LOADED = ', outside the loaded map'
-
-MOST_LOOKED_BACK = 100
-"""Of the frames of a camera that is looked for, so many may turn out to have seen where it was."""
 
 MAX_HELD_KEYFRAMES = 50
 """Keyframes that wait with their images; of more, every second one goes without."""
@@ -66,19 +63,6 @@ def left_out(result: FrameResult) -> FrameResult:
     )
 
 
-def searched(result: FrameResult) -> FrameResult:
-    """Return what is left of a frame that was searched for in a loaded map, and mapped in a submap
-    that is dropped.
-    """
-    return replace(left_out(result), in_submap=False, state=f'lost: {NOTHING_SEEN}')
-
-
-def outside(result: FrameResult) -> FrameResult:
-    """Return a frame that was not found in a loaded map, as one outside of it."""
-    state = result.state.replace(BEFORE_RECOGNITION, OUTSIDE_LOADED)
-    return replace(result, in_submap=False, outside=result.tracked, state=state)
-
-
 def turned(points: MovingPoints, T: Array) -> MovingPoints:
     """Return points and velocities in another frame, T (4, 4)."""
     return MovingPoints(
@@ -90,7 +74,8 @@ def turned(points: MovingPoints, T: Array) -> MovingPoints:
 class HeldResults:
     """Holds results in optical axes back, then turns all of them into ROS frames."""
 
-    def __init__(self) -> None:
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
         self._held: list[FrameResult] = []
         self._released: list[FrameResult] = []
         self._lost: list[FrameResult] = []
@@ -101,19 +86,17 @@ class HeldResults:
         """Whether nothing is held back."""
         return not self._held
 
-    def take(self, result: FrameResult, mount: Mount | None) -> list[FrameResult]:
+    def take(self, result: FrameResult) -> list[FrameResult]:
         """Take in the next result and return what is ready: nothing while it is of a submap."""
         self._held.append(result)
-        self._lost = [] if result.tracked else [*self._lost[-MOST_LOOKED_BACK:], result]
+        self._lost = [] if result.tracked else [*self._lost[-SEARCHED_FRAMES:], result]
         self._thin_out()
-        return [] if result.in_submap else self.release(mount)
+        return [] if result.in_submap else self.release()
 
     def change(self, change: Callable[[FrameResult], FrameResult]) -> None:
-        """Change the results that are held of a submap; those that are lost then may be recognised
-        later.
-        """
-        self._held = [change(result) if result.in_submap else result for result in self._held]
-        self._lost = [result for result in self._held if not result.tracked][-MOST_LOOKED_BACK:]
+        """Change the results that are held; those that are lost then may be recognised later."""
+        self._held = [change(result) for result in self._held]
+        self._lost = [result for result in self._held if not result.tracked][-SEARCHED_FRAMES:]
 
     def recognise(self, proof: Mapping[int, Track], T_world_odom: Array) -> None:
         """Release the frames once more that were lost when the camera was looked for, from the
@@ -133,17 +116,9 @@ class HeldResults:
             self._held = [*_before(self._held, again[0]), *again]
             self._released = _before(self._released, again[0])
 
-    def keep_submap(self, in_its_map: Callable[[FrameResult], FrameResult]) -> None:
-        """Make the submap the map: what was held before it is in none. in_its_map: brings a result
-        of the submap up to date.
-        """
-        self._held = [
-            replace(in_its_map(held), in_submap=False) if held.in_submap else left_out(held)
-            for held in self._held
-        ]
-
-    def release(self, mount: Mount | None) -> list[FrameResult]:
+    def release(self) -> list[FrameResult]:
         """Return the results in ROS frames, oldest first; none while the mount is unknown."""
+        mount = self._rig.base_mount
         if mount is None:
             return []
         ready, self._held = self._held, []
@@ -198,9 +173,7 @@ def in_map(result: FrameResult, T_map_world: Array) -> FrameResult:
 def _covariance_of_base(result: FrameResult, T_base_left: Array) -> Array:
     """Carry the covariance of the camera twist to the base, in odom axes."""
     T_odom_base = T_base_left @ result.T_odom_base @ invert(T_base_left)
-    axes = np.zeros((6, 6))
-    axes[:3, :3] = axes[3:, 3:] = T_odom_base[:3, :3]
-    A = axes @ adjoint(T_base_left)
+    A = np.kron(np.eye(2), T_odom_base[:3, :3]) @ adjoint(T_base_left)
     return A @ result.covariance @ A.T
 
 

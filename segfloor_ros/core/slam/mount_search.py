@@ -2,14 +2,61 @@
 
 from __future__ import annotations
 
-from segfloor_ros.core.contracts import BodySensors, Mount, StereoFrame
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.core.contracts import BodySensors, Mount, StereoFrame, Up
 from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.slam.held_results import HeldResults
-from segfloor_ros.core.slam.optional import MountMeter
 from segfloor_ros.core.slam.rig import Rig
 
 LOOK_NS = 500_000_000
 """While the mount is not known, the floor is measured this often between keyframes."""
+
+
+class MountMeter(Protocol):
+    """Measures the camera's mount from the floor it sees."""
+
+    def add(
+        self,
+        left: NDArray[np.uint8],
+        right: NDArray[np.uint8],
+        T_world_left: Array,
+        up_world: Up | None,
+        is_new_view: bool,
+    ) -> None:
+        """Take in one frame: rectified images (H, W), camera pose (4, 4) in the first one's frame,
+        and where an accelerometer has up in that frame. is_new_view: whether it is a keyframe;
+        others show what the last one does, and take its place.
+        """
+
+    def reset(self) -> None:
+        """Forget all frames: where the next ones are relative to them is not known."""
+
+    @property
+    def mount(self) -> Mount | None:
+        """The mount at the first frame, once it is known; later looks may show another."""
+
+    @property
+    def is_final(self) -> bool:
+        """Whether the mount is known, and looked at often enough."""
+
+    @property
+    def may_change(self) -> bool:
+        """Whether later looks may show another mount."""
+
+    def use(self, mount: Mount) -> None:
+        """Take a mount for given: it is compared with what is seen, and stays as it is."""
+
+    @property
+    def remark(self) -> str | None:
+        """How the mount that was in use differs from the one that the floor shows, in words."""
+
+    @property
+    def provisional(self) -> Mount:
+        """The mount as it seems so far, whatever little is known."""
 
 
 class MountSearch:

@@ -22,6 +22,7 @@ from scipy.special import chdtri
 from segfloor_ros.core.camera.model import MAX_OFFSET_PX, OFFSET_SIGMA_PX, StereoCamera
 from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.least_squares import SMALLEST
 
 LOCAL_KEYFRAMES = 10
 """Keyframes that move in a local adjustment, and adjustments that a keyframe takes part in: what is
@@ -43,9 +44,6 @@ GATE = 0.999
 """Probability with which what agrees is taken to agree, where a false alarm costs more."""
 
 MIN_DEPTH_M = 0.05
-
-SMALLEST = 1e-12
-"""Variance or pivot: what is not observed must not look exact, nor end in a division by zero."""
 
 SAME_PX = 4
 """Pixels, and disparities, that differ by no more may show the same point where a pose, or a
@@ -134,6 +132,13 @@ class Observations:
 
     uvd_px: NDArray[np.floating]
     sigma_px: NDArray[np.floating]
+
+    @staticmethod
+    def of_pixels(uv_px: NDArray[np.floating], sigma_px: Array | float) -> Observations:
+        """Return pixels (N, 2) before any disparity is known. sigma_px: of all, or (N, 1)."""
+        uvd, sigma = np.full((len(uv_px), 3), np.nan), np.ones((len(uv_px), 3))
+        uvd[:, :2], sigma[:, :2] = uv_px, sigma_px
+        return Observations(uvd, sigma)
 
     def __len__(self) -> int:
         return len(self.uvd_px)
@@ -255,7 +260,7 @@ def squared_norms(residual: Array, information: Array) -> Array:
 
 def huber_weights(chi2: Array, limit: Array) -> Array:
     """Return the weights (N,) of the Huber cost whose quadratic part ends at chi2 = limit."""
-    return np.sqrt(np.minimum(1.0, limit / np.maximum(chi2, 1e-12)))
+    return np.sqrt(np.minimum(1.0, limit / np.maximum(chi2, SMALLEST)))
 
 
 def huber_cost(chi2: Array, limit: Array) -> float:

@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.contracts import NO_POINT, RelativeMotion, Up
-from segfloor_ros.core.files.arrays import Arrays, check_lengths
-from segfloor_ros.core.geometry import Array, invert
-from segfloor_ros.core.slam.rig import Observations, Rig
-from segfloor_ros.core.slam.thresholds import PROOF
+from segfloor_ros.core.geometry import Array, invert, transform_points
+from segfloor_ros.core.slam.rig import MIN_DEPTH_M, Observations, Rig
+from segfloor_ros.core.slam.thresholds import FOUND_SHARE, PROOF
 from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.patch_alignment import SIDE_PX
 
@@ -34,20 +33,17 @@ MAX_PATCH_ZOOM = 1.3
 
 @dataclass(frozen=True)
 class Column:
-    """A column of rows of some shape. start: the value of a new point, unless it is given.
-    in_file: whether a file has it; the others follow from the rest.
-    """
+    """A column of rows of some shape. start: the value of a new point, unless it is given."""
 
     dtype: type
     shape: tuple[int, ...] = ()
     start: Any = 0
-    in_file: bool = True
 
 
 COLUMNS = {
     'xyz_world': Column(np.float64, (3,)),
     'stable_id': Column(np.int32),
-    'alive': Column(np.bool_, start=True, in_file=False),
+    'alive': Column(np.bool_, start=True),
     'descriptor': Column(np.uint8, (32,)),
     'patch': Column(np.uint8, (SIDE_PX, SIDE_PX)),
     'patch_distance_m': Column(np.float32),
@@ -56,14 +52,11 @@ COLUMNS = {
     'viewing_direction': Column(np.float32, (3,)),
     'visible_count': Column(np.int32, start=1),
     'found_count': Column(np.int32, start=1),
-    'observer_count': Column(np.int32, in_file=False),
+    'observer_count': Column(np.int32),
     'seen_through_count': Column(np.int32),
     'born': Column(np.int32),
     'seen_last': Column(np.int32),
 }
-
-OF_KEYFRAMES = ('born', 'seen_last')
-"""Columns that hold indices of keyframes."""
 
 
 class PointRows:
@@ -107,26 +100,6 @@ class PointRows:
     def reliability(self, rows: NDArray[np.integer]) -> Array:
         """Return how likely points (N,) are to be found when they should be seen, in (0, 1)."""
         return np.asarray(self['found_count'][rows] / (self['visible_count'][rows] + 2.0))
-
-    def to_arrays(self, rows: NDArray[np.intp]) -> Arrays:
-        """Return what a file holds of some rows (N,)."""
-        arrays: Arrays = {
-            f'point_{name}': self[name][rows] for name, column in COLUMNS.items() if column.in_file
-        }
-        return arrays | {'num_ever': np.array([self.num_ever])}
-
-    def from_arrays(self, arrays: Arrays, first_keyframe: int) -> None:
-        """Add what `to_arrays` returned, behind points that are all alive; its keyframes are
-        counted from first_keyframe on. Raises KeyError or ValueError for other arrays.
-        """
-        kept = [name for name, column in COLUMNS.items() if column.in_file]
-        check_lengths({name: arrays[f'point_{name}'] for name in kept})
-        rows = self.add(len(arrays['point_stable_id']))
-        for name in kept:
-            self[name][rows] = arrays[f'point_{name}']
-        for name in OF_KEYFRAMES:
-            self[name][rows] += first_keyframe
-        self.num_ever = int(arrays['num_ever'][0])
 
 
 Observers = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]
@@ -329,6 +302,11 @@ class KeyframeRecord:
     def T_world_camera(self) -> Array:
         """The camera's pose (4, 4)."""
         return invert(self.T_camera_world)
+
+    @property
+    def seen_ids(self) -> NDArray[np.int32]:
+        """The rows (N,) of the points that its features show."""
+        return self.point_id[self.point_id != NO_POINT]
 
 
 def _column(name: str) -> Any:
@@ -537,21 +515,19 @@ class SparseMap:
         self.edges.point[:] = new_row[self.edges.point]
         return len(kept)
 
-    def poor_points(self, settled_before: int, min_found_ratio: float) -> NDArray[np.intp]:
+    def poor_points(self, settled_before: int) -> NDArray[np.intp]:
         """Return ids of points that tracking seldom finds, that are gone, or that only one keyframe
         saw although made before keyframe `settled_before`.
         """
         found = self.points['found_count']
-        seldom = found < min_found_ratio * self.points['visible_count']
+        seldom = found < FOUND_SHARE * self.points['visible_count']
         seldom |= self.points['seen_through_count'] >= PROOF
         lonely = (self.points['born'] < settled_before) & (self.observer_count < 2)
         return np.flatnonzero(self.alive & (seldom | lonely))
 
     def covisible(self, ids: NDArray[np.integer]) -> Covisible:
         """Return the keyframes that observe any of the points (N,)."""
-        wanted = np.zeros(len(self.alive), bool)
-        wanted[ids] = True
-        shared = self.edges.count(wanted)
+        shared = self.edges.count(_among(self, ids))
         order = np.lexsort((-np.arange(len(shared)), -shared))
         order = order[shared[order] > 0]
         return order, shared[order]
@@ -565,9 +541,20 @@ class SparseMap:
 
     def edges_of(self, ids: NDArray[np.integer]) -> Observers:
         """Return all observations of the points (N,)."""
-        wanted = np.zeros(len(self.alive), bool)
-        wanted[ids] = True
-        return self.edges.to(wanted)
+        return self.edges.to(_among(self, ids))
+
+
+def _among(sparse_map: SparseMap, ids: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Return which points (P,) of a map are among some (N,)."""
+    wanted = np.zeros(len(sparse_map.alive), bool)
+    wanted[ids] = True
+    return wanted
+
+
+def median_depth_m(sparse_map: SparseMap, ids: NDArray[np.integer], T_camera_world: Array) -> float:
+    """Return the median depth of points (N,) before a camera."""
+    depth = transform_points(T_camera_world, sparse_map.xyz_world[ids])[:, 2]
+    return max(float(np.median(depth)), MIN_DEPTH_M) if len(ids) else MIN_DEPTH_M
 
 
 def features_of(sparse_map: SparseMap, keyframe: KeyframeRecord) -> Features:

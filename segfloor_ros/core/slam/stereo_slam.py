@@ -10,7 +10,6 @@ import numpy as np
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.camera.pixels import BlankBorder, Region
 from segfloor_ros.core.contracts import (
-    NO_POINT,
     UNKNOWN_COVARIANCE,
     FrameResult,
     Keyframe,
@@ -24,16 +23,16 @@ from segfloor_ros.core.files.arrays import Arrays
 from segfloor_ros.core.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.core.slam.held_results import NOTHING_SEEN, HeldResults, in_map
 from segfloor_ros.core.slam.mapping.back_end import BackEnd
-from segfloor_ros.core.slam.mount_search import MountSearch
-from segfloor_ros.core.slam.optional import MountMeter, Plugins
+from segfloor_ros.core.slam.mount_search import MountMeter, MountSearch
+from segfloor_ros.core.slam.optional import Plugins
 from segfloor_ros.core.slam.places.views import GroundViews
-from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, Rig
-from segfloor_ros.core.slam.session import MapSession, SessionState
+from segfloor_ros.core.slam.rig import Rig
+from segfloor_ros.core.slam.session import Parts, SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.snapshot import take_snapshot
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
-from segfloor_ros.core.slam.tracking.images import Images, dilate, is_inside
+from segfloor_ros.core.slam.tracking.images import Images
 from segfloor_ros.core.slam.tracking.patch_alignment import sample_patches
 from segfloor_ros.core.slam.tracking.track import Track
 from segfloor_ros.core.timing import StageTimes
@@ -41,37 +40,6 @@ from segfloor_ros.core.timing import StageTimes
 REPEATED = 'tracking: the image is the one before; the motion is taken to go on'
 UNSURE_M = 0.005
 """A place that the images leave more uncertain than this is said to be."""
-
-
-class LateMasks:
-    """Takes back the points of keyframes where masks that come later show what moves."""
-
-    def __init__(self, front_end: FrontEnd, sparse_map: SparseMap, dilation_px: int) -> None:
-        self._front_end, self._map, self._dilation_px = front_end, sparse_map, dilation_px
-        self._masks: list[tuple[KeyframeRecord, Region]] = []
-
-    def add(self, stamp_ns: int, mask: Region) -> None:
-        """Take in a mask (H, W) of the left image of a keyframe, 255 where something moves, for
-        the next frame. A stamp of no keyframe says nothing.
-        """
-        recent = self._map.keyframes[-LOCAL_KEYFRAMES:]  # others hardly change any more
-        keyframe = next((k for k in recent if k.stamp_ns == stamp_ns), None)
-        if keyframe is not None and not self._front_end.is_fixed:
-            self._masks.append((keyframe, dilate(mask, self._dilation_px)))
-
-    def take_points_back(self) -> None:
-        """Remove the points; while nothing is being adjusted."""
-        for keyframe, mask in self._masks:
-            if keyframe.index >= len(self._map.keyframes):
-                continue
-            if self._map.keyframes[keyframe.index] is not keyframe:
-                continue  # of a submap that was given up or merged
-            ids = keyframe.point_id[is_inside(mask, keyframe.observations.uvd_px[:, :2])]
-            ids = ids[ids != NO_POINT]
-            self._map.remove_points(ids[self._map.points['born'][ids] >= keyframe.index])
-        if self._masks:
-            self._masks.clear()
-            self._front_end.drop_dead()
 
 
 class StereoSlam:
@@ -105,28 +73,22 @@ class StereoSlam:
         self.rig = Rig(camera, mount)
         self.map = SparseMap(self.rig)
         self.sessions: list[dict[str, int]] = []
-        self._camera = camera
-        self._settings = settings
+        self._mask_dilation_px = settings.mask_dilation_px
         self._times = times or StageTimes()
         self.sensors, self.rig_check = plugins.sensors, plugins.rig_check
         self.front_end = FrontEnd(settings, self.map, self.sensors)
-        self.back_end = BackEnd(settings, self.map, self.front_end, background, plugins.keeper)
+        self.back_end = BackEnd(self.map, self.front_end, background)
         self._ground = GroundViews(self.rig)
         self._border = BlankBorder()
         self._moving = plugins.moving
-        held = HeldResults()
-        self._mount_search = MountSearch(self.rig, mount_meter, self.sensors, held)
-        self.session = MapSession(
-            self.map,
-            self.front_end,
-            self.back_end,
-            self.sensors,
-            self._moving,
-            self._mount_search,
-            held,
+        held = HeldResults(self.rig)
+        search = MountSearch(self.rig, mount_meter, self.sensors, held)
+        self._mount_search = search
+        self.session = plugins.session(
+            Parts(self.map, self.front_end, self.back_end, self.sensors, self._moving, search, held)
         )
         self._shows_nothing = False
-        self.late_masks = LateMasks(self.front_end, self.map, settings.mask_dilation_px)
+        self.late_masks = plugins.late_masks(self.front_end, self.map, self._mask_dilation_px)
         self.announce: Callable[[FrameResult, StereoFrame, Region | None], None] | None = None
 
     @property
@@ -191,11 +153,10 @@ class StereoSlam:
         resumed: until the camera is seen there, by what wheels measure, or with the last pose and a
         covariance that grows. Raises KeyError or ValueError for arrays that are no map.
         """
-        self.back_end.from_arrays(arrays)
+        self.session.load(arrays, last)
         self.front_end.is_fixed = localize
         self.rig.base = None
         self._mount_search.use(mount)
-        self.session.load(last)
 
     def search_near(self, T_map_base: Array, reach_m: float, reach_rad: float) -> None:
         """Look for the camera around a pose of the base (4, 4) alone, as far as somebody who knows
@@ -226,7 +187,7 @@ class StereoSlam:
             self.rig_check.watch(frame, float(rotation_angle(turned[:3, :3])))
             frame = self.rig_check.corrected(frame)
         border = self._border.see(frame.left)
-        return frame, Images.of(frame, self._camera, border, self._settings.mask_dilation_px)
+        return frame, Images.of(frame, self.rig.camera, border, self._mask_dilation_px)
 
     def _track(self, frame: StereoFrame, images: Images, fault: str) -> Track | None:
         """Find the pose of a frame in the map; by sensors, or by a search, where that fails."""

@@ -15,13 +15,18 @@ CHANCE_SHARE = 0.1
 """Share of the points of a view of which no more may be found by chance: far ones alone fit many
 places."""
 
-MOST = 0.6
-"""Share of what was followed that must be left of it."""
-
 NEARLY_ALL = 0.9
 """Share of a keyframe's points that others must see as well, or of a view that they must cover, for
 it to add nothing (Mur-Artal et al., ORB-SLAM, IEEE T-RO 2015, section VI-E); and what counts as
 much as the best."""
+
+SEARCHED_FRAMES = 100
+"""Frames of a camera that is looked for: for so long only the neighbourhood of a given pose is
+searched, which may be wrong, and so many may turn out to have seen where it was."""
+
+FOUND_SHARE = 0.25
+"""Least share of what should be seen that must be found: by a frame, of the points of its keyframe,
+and in frames, of a point (Mur-Artal et al., ORB-SLAM, 2015, sections V-E and VI-B)."""
 
 POINTS_PER_KEYFRAME = 300
 """Points of a keyframe that hold the map together where it is adjusted as a whole, those that most

@@ -227,7 +227,7 @@ def test_a_frame_that_is_lost_is_looked_for_once(mapped, monkeypatch):
 
 
 def test_after_a_pose_that_was_wrong_the_whole_map_is_searched_again(mapped, monkeypatch):
-    monkeypatch.setattr('segfloor_ros.core.slam.places.place_recognition.NARROW_SEARCHES', 20)
+    monkeypatch.setattr('segfloor_ros.core.slam.places.place_recognition.SEARCHED_FRAMES', 20)
     slam, other, poses = loaded(mapped, localize=False), StereoRoom(seed=77), there(25)
     slam.process(other.frame(5, poses[0]))
     slam.search_near(planar_pose(30.0, 0.0, 0.0), 1.0, 0.5)

@@ -20,7 +20,7 @@ from segfloor_ros.core.plugins.maps.saved_slam import (
     load_slam,
     save_slam,
 )
-from segfloor_ros.core.slam.session import HARDLY_BEGUN
+from segfloor_ros.core.plugins.maps.session import HARDLY_BEGUN
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 
 SETTINGS = StereoSlamSettings(num_features=600)

@@ -7,7 +7,7 @@ import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.contracts import Mount, StereoFrame
-from segfloor_ros.core.plugins.maps.known_map import SubmapKeeper
+from segfloor_ros.core.plugins.maps.session import MapSession
 from segfloor_ros.core.slam.optional import NoSensors, NothingMoves, Plugins
 from segfloor_ros.core.slam.session import SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
@@ -52,7 +52,7 @@ def equipped() -> tuple[StereoSlam, Counter]:
         def reset_world(self) -> None:
             resets['world'] += 1
 
-    plugins = Plugins(moving=Moving(), sensors=Sensors(), keeper=SubmapKeeper())
+    plugins = Plugins(moving=Moving(), sensors=Sensors(), session=MapSession)
     slam = StereoSlam(CAMERA, SETTINGS, mount_meter=Meter(resets), plugins=plugins)
     resets.clear()
     return slam, resets

@@ -4,7 +4,7 @@ import numpy as np
 from hand_made_maps import CAMERA, add, keyframe
 
 from segfloor_ros.core.contracts import NO_POINT
-from segfloor_ros.core.plugins.maps.map_arrays import map_to_arrays
+from segfloor_ros.core.plugins.maps.map_arrays import add_points, map_to_arrays, points_to_arrays
 from segfloor_ros.core.slam.places import loop_closing
 from segfloor_ros.core.slam.rig import Rig
 from segfloor_ros.core.slam.sparse_map import Match, PointRows, SparseMap, features_of
@@ -109,13 +109,14 @@ def test_a_place_seen_before_features_were_forgotten_merges_no_points():
     np.testing.assert_array_equal(first.point_id, [0, 1, 2])
 
 
-def test_points_that_tracking_seldom_finds_are_poor():
+def test_points_that_tracking_seldom_finds_are_poor(monkeypatch):
     sparse_map, _, _ = two_keyframes()
     for _ in range(10):
         sparse_map.points.note_tracking(np.array([0, 1, 2]), np.array([1, 2]))
     # Point 0 was found once (when it was made) in eleven chances.
-    np.testing.assert_array_equal(sparse_map.poor_points(0, 0.25), [0])
-    np.testing.assert_array_equal(sparse_map.poor_points(0, 0.05), [])
+    np.testing.assert_array_equal(sparse_map.poor_points(0), [0])
+    monkeypatch.setattr('segfloor_ros.core.slam.sparse_map.FOUND_SHARE', 0.05)
+    np.testing.assert_array_equal(sparse_map.poor_points(0), [])
 
 
 def test_grows_beyond_its_first_buffer():
@@ -129,7 +130,7 @@ def test_points_of_a_map_behind_another_count_its_keyframes_from_where_they_come
     own, other = PointRows(), PointRows()
     own.add(3)
     other.add(2, born=np.array([0, 4]), seen_last=np.array([4, 5]))
-    own.from_arrays(other.to_arrays(np.arange(2)), first_keyframe=7)
+    add_points(own, points_to_arrays(other, np.arange(2)), first_keyframe=7)
     assert own['born'].tolist() == [0, 0, 0, 7, 11]
     assert own['seen_last'][3:].tolist() == [11, 12]
     assert own['stable_id'].tolist() == [0, 1, 2, 0, 1]

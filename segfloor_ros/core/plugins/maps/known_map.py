@@ -12,39 +12,96 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.contracts import NO_POINT
+from segfloor_ros.core.contracts import NO_POINT, Mount
 from segfloor_ros.core.files.arrays import Arrays
-from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.plugins.maps.map_arrays import fill_map, map_to_arrays, moved
 from segfloor_ros.core.slam.mapping.bundle_adjustment import apply_global, copy_map, solve_global
+from segfloor_ros.core.slam.places.evidence import of_counts
 from segfloor_ros.core.slam.places.loop_closing import (
     apply_closing,
     fuse_latest,
     loop_edge,
     merge_pairs,
+    optimise,
     plan_closing,
-    solve_closing,
 )
-from segfloor_ros.core.slam.places.loops import LoopDetector, PlaceMatcher, drift
+from segfloor_ros.core.slam.places.loops import UP_SIGMA_M, LoopDetector, PlaceMatcher, drift
 from segfloor_ros.core.slam.places.place_recognition import (
     PlaceIndex,
     PlaceRecognition,
     Relocaliser,
     Vocabulary,
+    greatest_speed_mps,
 )
-from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, OffsetEstimate, Rig
-from segfloor_ros.core.slam.sparse_map import GroundView, KeyframeRecord, Match, SparseMap
+from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, OffsetEstimate, Rig, chi2_limit
+from segfloor_ros.core.slam.sparse_map import (
+    LINK_SIGMA,
+    GroundView,
+    KeyframeRecord,
+    Match,
+    SparseMap,
+)
+from segfloor_ros.core.slam.thresholds import SAME
 from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.map_tracking import Pixels
 from segfloor_ros.core.slam.tracking.track import Track
 
 OFFSET = 'disparity_offset'
 """What a map knows of the disparity offset, by name."""
+
+
+class KnownPlaces(PlaceMatcher):
+    """Matches keyframes with the places of another map than their own."""
+
+    def is_within_reach(self, match: Match) -> bool:
+        """Whether the robot can have come there while it was lost: from the last keyframe of the
+        known map to the first of its own.
+        """
+        first, known = self._map.keyframes[0], self._known.keyframes
+        T_own_known = drift(self._map, match)
+        way = known[-1].T_camera_world @ invert(first.T_camera_world @ T_own_known)
+        lost_s = 1e-9 * (first.stamp_ns - known[-1].stamp_ns)
+        return bool(np.linalg.norm(way[:3, 3]) <= SAME[0] + greatest_speed_mps(known) * lost_s)
+
+    def around(self, match: Match) -> float:
+        """Return how much likelier what stands around the keyframe stands where the known map has
+        it than in a place beside: floors repeat themselves.
+        """
+        mount = self._map.rig.mount
+        if mount is None:
+            return 0.0
+        recent = np.arange(max(0, match.keyframe - NEIGHBOURS), match.keyframe + 1)
+        own = upright(self._map, mount, self._map.points_of(recent))
+        own = transform_points(invert(drift(self._map, match)), own)
+        reach_m = np.sqrt(chi2_limit(3)) * LINK_SIGMA[0]
+        along, aside, _ = mount.T_base_left[:3, :3]
+        angles = np.linspace(0.0, 2 * np.pi, 8, endpoint=False)
+        ring = reach_m * (np.outer(np.cos(angles), along) + np.outer(np.sin(angles), aside))
+        shifts = np.concatenate([np.zeros((1, 3)), 4 * ring, 8 * ring, 12 * ring])
+        gaps_m, _ = self._upright.query(own[:, None] + shifts, distance_upper_bound=reach_m)
+        here, *beside = np.isfinite(gaps_m).sum(axis=0)
+        return of_counts(here, max(beside))
+
+    @cached_property
+    def _upright(self) -> cKDTree:
+        """What stands in the known map, once it does not change any more."""
+        assert self._map.rig.mount is not None
+        alive = np.flatnonzero(self._known.alive)
+        return cKDTree(upright(self._known, self._map.rig.mount, alive))
+
+
+def upright(sparse_map: SparseMap, mount: Mount, ids: NDArray[np.integer]) -> Array:
+    """Return those of points (N,), (M, 3), that stand clearly above the floor."""
+    xyz = sparse_map.xyz_world[ids]
+    return xyz[transform_points(mount.T_base_left, xyz)[:, 2] > 4 * UP_SIGMA_M]
 
 
 class KnownMap:
@@ -58,8 +115,9 @@ class KnownMap:
         self._places = PlaceRecognition(self._map)
         self._places.from_arrays(arrays)
         self._relocaliser = Relocaliser(self._map, self._places)
-        self._matcher = PlaceMatcher(own, self._map, self._places)
+        self._matcher = KnownPlaces(own, self._map, self._places)
         self._floors = FloorIndex(self._map.keyframes)
+        self._matches: list[Match] = []
 
     @property
     def num_keyframes(self) -> int:
@@ -77,7 +135,9 @@ class KnownMap:
         by_look = self._matcher.look(keyframe, images, anywhere, ~anywhere)
         found += [by_look] if by_look else []
         seen = self._matcher.best(keyframe, found, self._travel)
-        return self._matcher.add(None if seen is None or seen[1].objection else seen)
+        seen = None if seen is None or seen[1].objection else seen
+        self._matches = self._matcher.sightings.add(seen)
+        return bool(self._matches)
 
     def _travel(self, match: Match) -> float:
         """Return how likely the robot is at a match: at any place that it can have come to."""
@@ -108,7 +168,7 @@ class KnownMap:
         """Merge the drive's own map into the known one, with the same ids and stamps. Returns the
         words of all keyframes.
         """
-        matches = self._matcher.matches
+        matches = self._matches
         latest, own_ids = matches[-1], [self._own_ids(match) for match in matches]
         T_known_own = invert(drift(self._own, latest))
         before = len(self._map.keyframes)
@@ -125,7 +185,7 @@ class KnownMap:
 
     def to_arrays(self) -> Arrays:
         """Return the known map and the words of its keyframes."""
-        return map_to_arrays(self._map) | self._places.to_arrays()
+        return map_and_words(self._map, self._places)
 
     def restore(self, known: Arrays) -> None:
         """Put the known map, as `to_arrays` returns it, in the place of the drive's own."""
@@ -138,6 +198,11 @@ class KnownMap:
         rows = np.minimum(rows, len(self._own.stable_id) - 1)
         there = (self._own.stable_id[rows] == stable_ids) & self._own.alive[rows]
         return np.where(there, rows, -1)
+
+
+def map_and_words(sparse_map: SparseMap, places: PlaceRecognition) -> Arrays:
+    """Return a map and the words of its keyframes."""
+    return map_to_arrays(sparse_map) | places.to_arrays()
 
 
 def merge_slam(first: Arrays, second: Arrays, rig: Rig) -> Arrays | None:
@@ -156,7 +221,7 @@ def merge_slam(first: Arrays, second: Arrays, rig: Rig) -> Arrays | None:
     places = PlaceRecognition(merged)
     places.from_arrays(words)
     _close_loops(merged, places, len(first['keyframe_stamp_ns']))
-    return map_to_arrays(merged) | places.to_arrays() | {OFFSET: first[OFFSET]}
+    return map_and_words(merged, places) | {OFFSET: first[OFFSET]}
 
 
 def _close_loops(merged: SparseMap, places: PlaceRecognition, begin: int) -> None:
@@ -168,7 +233,7 @@ def _close_loops(merged: SparseMap, places: PlaceRecognition, begin: int) -> Non
         matches = loops.detect(keyframe, keyframe.observations.exact())
         if matches:
             closing = plan_closing(merged, matches)
-            apply_closing(merged, closing, solve_closing(closing))
+            apply_closing(merged, closing, optimise(closing.graph))
     copied = copy_map(merged, merged.rig.offset.estimate, None)
     apply_global(merged, solve_global(merged.rig.camera, copied, lambda: True))
 
@@ -186,24 +251,6 @@ def as_seen_by(camera: StereoCamera, offset_px: float, own: StereoCamera, arrays
         'feature_uvd_px': uvd_px.astype(np.float32),
         'feature_sigma_px': (arrays['feature_sigma_px'] * zoom).astype(np.float16),
     }
-
-
-class SubmapKeeper:
-    """Lets SLAM save its map, go on with one, and map a submap beside one it was lost in."""
-
-    can_hold = True
-
-    def to_arrays(self, sparse_map: SparseMap) -> Arrays:
-        """Return a map as arrays."""
-        return map_to_arrays(sparse_map)
-
-    def fill(self, sparse_map: SparseMap, arrays: Arrays) -> None:
-        """Add a map to an empty one. Raises KeyError or ValueError for arrays that are no map."""
-        fill_map(sparse_map, arrays)
-
-    def hold(self, own: SparseMap, places: PlaceRecognition, of_drive: bool) -> KnownMap:
-        """Return the present map as a known one, beside which `own` may begin anew."""
-        return KnownMap(own, map_to_arrays(own) | places.to_arrays(), of_drive)
 
 
 class FloorIndex:

@@ -12,17 +12,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.contracts import NO_POINT
-from segfloor_ros.core.files.arrays import Arrays, joined, split
+from segfloor_ros.core.files.arrays import Arrays, check_lengths, joined, split
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.sparse_map import (
+    COLUMNS,
     NOTHING,
     GroundView,
     KeyframeRecord,
     LoopEdge,
+    PointRows,
     Retirement,
     SparseMap,
 )
+
+IN_FILE = tuple(name for name in COLUMNS if name not in ('alive', 'observer_count'))
+"""Columns of points that a file holds; the others follow from the rest."""
+
+OF_KEYFRAMES = ('born', 'seen_last')
+"""Columns that hold indices of keyframes."""
+
+
+def points_to_arrays(points: PointRows, rows: NDArray[np.intp]) -> Arrays:
+    """Return what a file holds of some points (N,)."""
+    arrays = {f'point_{name}': points[name][rows] for name in IN_FILE}
+    return arrays | {'num_ever': np.array([points.num_ever])}
+
+
+def add_points(points: PointRows, arrays: Arrays, first_keyframe: int) -> None:
+    """Add points of a file behind those that are there, all alive; its keyframes are counted from
+    first_keyframe on. Raises KeyError or ValueError for other arrays.
+    """
+    check_lengths({name: arrays[f'point_{name}'] for name in IN_FILE})
+    rows = points.add(len(arrays['point_stable_id']))
+    for name in IN_FILE:
+        points[name][rows] = arrays[f'point_{name}']
+    for name in OF_KEYFRAMES:
+        points[name][rows] += first_keyframe
+    points.num_ever = int(arrays['num_ever'][0])
 
 
 def map_to_arrays(sparse_map: SparseMap) -> Arrays:
@@ -45,7 +72,7 @@ def map_to_arrays(sparse_map: SparseMap) -> Arrays:
     corners, corner_count = joined([k.ground.xy_m for k in keyframes], NOTHING.xy_m)
     looks, _ = joined([k.ground.descriptor for k in keyframes], NOTHING.descriptor)
     loops = sparse_map.loops
-    return sparse_map.points.to_arrays(alive) | {
+    return points_to_arrays(sparse_map.points, alive) | {
         'keyframe_frame_index': np.array([k.frame_index for k in keyframes], np.int64),
         'keyframe_stamp_ns': np.array([k.stamp_ns for k in keyframes], np.int64),
         'keyframe_T_camera_world': _stack([k.T_camera_world for k in keyframes]),
@@ -72,7 +99,7 @@ def fill_map(sparse_map: SparseMap, arrays: Arrays) -> None:
     filled like this. Raises KeyError or ValueError for arrays that are no map.
     """
     first, first_row = len(sparse_map.keyframes), len(sparse_map.alive)
-    sparse_map.points.from_arrays(arrays, first)
+    add_points(sparse_map.points, arrays, first)
     for index, record in enumerate(_keyframes(arrays, first, first_row), first):
         if record.index != index or (record.point_id >= len(sparse_map.alive)).any():
             raise ValueError('features of points that are not there')

@@ -13,12 +13,12 @@ from segfloor_ros.core.files.arrays import Arrays, MapFile, split, take
 from segfloor_ros.core.files.results import read_map_file, write_map_file
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.grid.keyframe_evidence import LENGTHS
+from segfloor_ros.core.plugins.maps.map_arrays import OF_KEYFRAMES
 from segfloor_ros.core.plugins.maps.saved_slam import PART as SLAM
 from segfloor_ros.core.plugins.maps.saved_slam import parts_that_fit
 from segfloor_ros.core.plugins.semantics.label_map import LABELS, SEEN_LENGTHS
 from segfloor_ros.core.slam.places.views import NEW_MOTION_RATIO, SECOND_VISIT, novelty
 from segfloor_ros.core.slam.rig import MIN_DEPTH_M
-from segfloor_ros.core.slam.sparse_map import OF_KEYFRAMES
 from segfloor_ros.core.slam.thresholds import MAJORITY, PROOF
 
 OF_KEYFRAME = 'keyframe_', 'feature_', 'corner_', 'word'

@@ -24,16 +24,13 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     solve_global,
 )
 from segfloor_ros.core.slam.mapping.keyframe_mapping import LocalMapper
-from segfloor_ros.core.slam.optional import KnownMap, MapKeeper
 from segfloor_ros.core.slam.places.loop_closing import (
     Closing,
     apply_closing,
+    optimise,
     plan_closing,
-    solve_closing,
 )
 from segfloor_ros.core.slam.places.loops import Candidate, LoopDetector
-from segfloor_ros.core.slam.rig import OffsetEstimate
-from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 from segfloor_ros.core.slam.tracking.images import Images
@@ -50,20 +47,11 @@ class BackEnd:
     loop that moves it far or once it has grown.
 
     background: on threads beside tracking; else at once, so that the outcome does not depend on
-    timing. Tracking never waits for an adjustment of the whole map. keeper: of maps as arrays.
+    timing. Tracking never waits for an adjustment of the whole map.
     """
 
-    def __init__(
-        self,
-        settings: StereoSlamSettings,
-        sparse_map: SparseMap,
-        front_end: FrontEnd,
-        background: bool,
-        keeper: MapKeeper,
-    ) -> None:
-        self.keeper = keeper
+    def __init__(self, sparse_map: SparseMap, front_end: FrontEnd, background: bool) -> None:
         self._front_end = front_end
-        self._longest_frames = settings.keyframe_max_frames
         self.mapper = LocalMapper(sparse_map)
         self.places = front_end.places
         self.loop_count = 0
@@ -111,7 +99,7 @@ class BackEnd:
         neighbourhood. up_world: as an accelerometer has it.
         """
         self._up_world = up_world
-        self._follow(partial(self._adjust_to, keyframe, images))
+        self.follow(partial(self._adjust_to, keyframe, images))
 
     def _adjust_to(self, keyframe: KeyframeRecord, images: Images) -> bool:
         """Returns whether the map has changed already."""
@@ -127,24 +115,10 @@ class BackEnd:
     def reset(self) -> None:
         """Begin an empty map; no id is given twice."""
         self._map.reset(self._map.points.num_ever)
-        self._reset_places()
+        self.reset_places()
 
-    def merge(self, known: KnownMap) -> None:
-        """Merge the map into a known one in which its latest keyframe was recognised."""
-
-        def merge() -> bool:
-            self._reset_places(known.merge(self.places.to_arrays()))
-            return True
-
-        self._follow(merge)
-
-    def restore(self, known: KnownMap) -> None:
-        """Replace the map by a known one."""
-        arrays = known.to_arrays()
-        known.restore(arrays)
-        self._reset_places(arrays)
-
-    def _reset_places(self, words: Arrays | None = None) -> None:
+    def reset_places(self, words: Arrays | None = None) -> None:
+        """Believe in no place of the map, which is another one now. words: of its keyframes."""
         self._global.reset()
         self.places.reset()
         self.loops.reset()
@@ -152,7 +126,7 @@ class BackEnd:
         if words is not None:
             self.places.from_arrays(words)
 
-    def _follow(self, change: Callable[[], bool]) -> None:
+    def follow(self, change: Callable[[], bool]) -> None:
         """Let the camera, and with it `odom`, move along with the latest keyframe. change: of the
         map; returns whether there was any.
         """
@@ -165,32 +139,14 @@ class BackEnd:
         waited for.
         """
         if self._map.keyframes:
-            self._follow(partial(self._collect, wait))
+            self.follow(partial(self._collect, wait))
 
     def _collect(self, wait: bool) -> bool:
         """Returns whether there was anything."""
-        finished = [self._local.collect(wait)]
-        if finished[0] is not None:
-            finished[0]()
+        has_changed = self._local.collect(wait)
         if not self._local.holds_one:
-            finished.append(self._global.collect(wait=False))
-            if finished[1] is not None:
-                finished[1]()
-        return any(apply is not None for apply in finished)
-
-    def to_arrays(self, known: KnownMap | None) -> Arrays:
-        """Return the map and what belongs to it, for a file. known: another map to return."""
-        offset = self._rig.offset.estimate
-        measured: Arrays = {'disparity_offset': np.array([offset.value_px, offset.information])}
-        if known is not None:
-            return known.to_arrays() | measured
-        return self.keeper.to_arrays(self._map) | self.places.to_arrays() | measured
-
-    def from_arrays(self, arrays: Arrays) -> None:
-        """Go on with what `to_arrays` returned."""
-        self.keeper.fill(self._map, arrays)
-        self.places.from_arrays(arrays)
-        self._rig.offset.estimate = OffsetEstimate(*arrays['disparity_offset'].tolist())
+            has_changed |= self._global.collect(wait=False)
+        return has_changed
 
     def close(self) -> None:
         """End the background threads, if there are any."""
@@ -217,7 +173,7 @@ class BackEnd:
             return False
         closing = plan_closing(self._map, matches)
         self._is_closing = True
-        self._local.submit(partial(solve_closing, closing), partial(self._apply, closing))
+        self._local.submit(partial(optimise, closing.graph), partial(self._apply, closing))
         return True
 
     def _apply(self, closing: Closing, result: tuple[Array, Array]) -> None:
@@ -289,16 +245,16 @@ class AdjustmentRunner:
             self._result = Future()
             self._result.set_result(solve())
 
-    def collect(self, wait: bool) -> Callable[[], None] | None:
-        """Return what applies a finished adjustment, once, or None; with `wait` a running one is
-        waited for.
+    def collect(self, wait: bool) -> bool:
+        """Apply a finished adjustment; with `wait` a running one is waited for. Returns whether
+        there was one.
         """
         apply = self._apply
         if apply is None or not (wait or self._result.done()):
-            return None
+            return False
         self._apply = None
-        result = self._result.result()
-        return lambda: apply(result)
+        apply(self._result.result())
+        return True
 
     def close(self) -> None:
         """Wait for a running adjustment and end the thread."""

@@ -25,25 +25,21 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     gather,
 )
 from segfloor_ros.core.slam.mapping.normal_equations import factors_of, motion_before
-from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, SAME_PX
+from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, ENOUGH, MAJORITY, NEARLY_ALL, PROOF
 from segfloor_ros.core.slam.tracking.images import MAX_HAMMING, Images, hamming, one_to_one
 from segfloor_ros.core.slam.tracking.map_tracking import predict_points
-from segfloor_ros.core.slam.tracking.patch_alignment import (
-    ALIGNED_PX,
-    guess_disparity,
-    measure_disparity,
-)
+from segfloor_ros.core.slam.tracking.patch_alignment import ALIGNED_PX, measure_disparities
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures
 from segfloor_ros.core.timing import timed
 
 MIN_DISPARITY_PX = 1.0
 """Less is known too badly, as a share of it, for a new point."""
 
-SETTLING_KEYFRAMES, MIN_FOUND_RATIO = 2, 0.25
-"""Within so many keyframes others must see a new point too, and in this share of the frames that
-should show it a point must be found (Mur-Artal et al., ORB-SLAM, 2015, section VI-B)."""
+SETTLING_KEYFRAMES = 2
+"""Within so many keyframes others must see a new point too (Mur-Artal et al., ORB-SLAM, 2015,
+section VI-B)."""
 
 MAX_OCTAVES_APART, CANDIDATES = 2.5, 4
 """Levels of the pyramid between two views of what may be one point, and points tried for each."""
@@ -91,12 +87,7 @@ class LocalMapper:
         missing = np.flatnonzero(
             np.isnan(observations.uvd_px[:, 2]) & (observed.point_id == NO_POINT)
         )
-        uv_px = observations.uvd_px[missing, :2]
-        guess: Array = np.zeros(len(missing))
-        if not images.depth_scale:
-            guess = guess_disparity(frame.left, frame.right, uv_px)
-        found = np.isfinite(guess)
-        measure_disparity(images, observations, missing[found], guess[found], SAME_PX)
+        measure_disparities(frame, images, observations, missing)
 
     @timed
     def insert(self, keyframe: KeyframeRecord, patches: NDArray[np.uint8]) -> None:
@@ -112,7 +103,7 @@ class LocalMapper:
         """Return the earlier keyframes that share most points with a new one; the one before it
         where none does.
         """
-        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        own = keyframe.seen_ids
         order, shared = self._map.covisible(own)
         enough = max(ENOUGH, CHANCE_SHARE * len(own))
         near = order[(shared >= enough) & (order != keyframe.index)]
@@ -184,7 +175,7 @@ class LocalMapper:
         outliers = ~result.inliers
         self._map.unlink(adjustment.edge_keyframe[outliers], adjustment.edge_row[outliers])
         settled = adjustment.newest - SETTLING_KEYFRAMES
-        self._map.remove_points(self._map.poor_points(settled, MIN_FOUND_RATIO))
+        self._map.remove_points(self._map.poor_points(settled))
         retire_redundant(self._map, adjustment.free)
         if adjustment.newest >= NEIGHBOURS:
             self._map.thin_out(self._map.keyframes[adjustment.newest - NEIGHBOURS])
@@ -196,7 +187,7 @@ class LocalMapper:
         """Return the covisible keyframes that move and those that hold them; the first one
         does not move here.
         """
-        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        own = keyframe.seen_ids
         order, shared = self._map.covisible(own)
         near = order[(shared >= ENOUGH) & (order != keyframe.index)]
         near = np.concatenate([near, np.setdiff1d(_linked(self._map, keyframe), near)[::-1]])
@@ -243,7 +234,7 @@ def find_duplicates(sparse_map: SparseMap, keyframe: KeyframeRecord) -> Pairs:
     """Return pairs of point rows (N,), (N,): of the keyframe, and of its neighbours alone. Each
     point occurs at most once.
     """
-    own = np.unique(keyframe.point_id[keyframe.point_id != NO_POINT])
+    own = np.unique(keyframe.seen_ids)
     order, _ = sparse_map.covisible(own)
     around = sparse_map.points_of(order[:NEIGHBOURS])
     others = around[~np.isin(around, own)]
@@ -274,7 +265,7 @@ def retire_redundant(sparse_map: SparseMap, candidates: NDArray[np.integer]) -> 
     for index in sorted(int(k) for k in candidates if 0 < k < last):
         keyframe = sparse_map.keyframes[index]
         if keyframe.retired is None and redundant_share(sparse_map, keyframe) >= NEARLY_ALL:
-            order, _ = sparse_map.covisible(keyframe.point_id[keyframe.point_id != NO_POINT])
+            order, _ = sparse_map.covisible(keyframe.seen_ids)
             reference = order[order != index][0]
             sparse_map.retire(keyframe, sparse_map.keyframes[reference])
 

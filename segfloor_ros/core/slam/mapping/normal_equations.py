@@ -33,9 +33,9 @@ from scipy.sparse.linalg import splu
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import RelativeMotion, Up
 from segfloor_ros.core.geometry import Array, invert
+from segfloor_ros.core.least_squares import SMALLEST
 from segfloor_ros.core.slam.rig import (
     LOCAL_KEYFRAMES,
-    SMALLEST,
     chi2_limit,
     huber_cost,
     huber_weights,

@@ -57,11 +57,8 @@ def plan_closing(sparse_map: SparseMap, matches: list[Match]) -> Closing:
     T_loops = np.stack([loop.T_i_j for loop in loops])
     of_links = np.tile(np.repeat(LINK_SIGMA, 3), (len(i), 1))
     sigma = np.concatenate([of_links, [loop.sigma for loop in loops]])
-    fixed = np.zeros(len(keyframes), bool)
-    fixed[0] = True
     graph = PoseGraph(
         poses,
-        fixed,
         np.append(i, [loop.i for loop in loops]).astype(np.intp),
         np.append(j, [loop.j for loop in loops]).astype(np.intp),
         np.concatenate([poses[i] @ invert(poses[j]), T_loops]),
@@ -77,11 +74,6 @@ def loop_edge(sparse_map: SparseMap, match: Match) -> LoopEdge:
     place = sparse_map.keyframes[match.place]
     T_i_j = match.T_camera_world @ place.T_world_camera
     return LoopEdge(match.keyframe, match.place, T_i_j, by_floor=len(match.rows) == 0)
-
-
-def solve_closing(closing: Closing) -> tuple[Array, Array]:
-    """Optimise the copy; safe on another thread."""
-    return optimise(closing.graph)
 
 
 def apply_closing(sparse_map: SparseMap, closing: Closing, result: tuple[Array, Array]) -> bool:
@@ -133,11 +125,10 @@ def merge_pairs(sparse_map: SparseMap, own: NDArray[np.integer], old: NDArray[np
 class PoseGraph:
     """T_camera_world: (K, 4, 4). Edge m (M in total) says that camera i[m] sees camera j[m] at
     T_i_j[m] (M, 4, 4), to sigma (M, 6) in metres and radians. is_robust: (M,) which edges
-    may be wrong. fixed: (K,) which cameras stay.
+    may be wrong. The first camera stays.
     """
 
     T_camera_world: Array
-    fixed: NDArray[np.bool_]
     i: NDArray[np.intp]
     j: NDArray[np.intp]
     T_i_j: Array
@@ -186,15 +177,13 @@ class _State:
         rows = 2 * np.arange(len(graph.i) + 1)
         shape = (6 * len(graph.i), 6 * count)
         J = sparse.bsr_array((blocks, columns, rows), shape=shape).tocsr()
-        moving = np.flatnonzero(np.repeat(~graph.fixed, 6))
-        J = J[:, moving]
+        J = J[:, 6:]
         H, gradient = (J.T @ J).tocsc(), -J.T @ (np.sqrt(self.weight)[:, None] * self.error).ravel()
 
         def stepped(damping: float) -> tuple[_State, float]:
             added = (damping * H.diagonal() + 1e-12)[None]
             damped = H + sparse.dia_array((added, [0]), shape=H.shape).tocsc()
-            step = np.zeros(6 * count)
-            step[moving] = solve_symmetric(damped.tocsc(), gradient)
+            step = np.append(np.zeros(6), solve_symmetric(damped.tocsc(), gradient))
             return _State.at(graph, se3_exp(step.reshape(-1, 6)) @ poses), 0.1
 
         return stepped

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +17,10 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from segfloor_ros.core.contracts import NO_POINT, Mount
+from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.core.slam.places.evidence import HOPELESS, PlaceEvidence, of_counts, of_errors
-from segfloor_ros.core.slam.places.place_recognition import (
-    PlaceRecognition,
-    Sightings,
-    greatest_speed_mps,
-)
+from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition, Sightings
 from segfloor_ros.core.slam.places.views import (
     ALIKE_SHARE,
     motion_between,
@@ -33,7 +28,7 @@ from segfloor_ros.core.slam.places.views import (
     seen_ahead_m,
     views_near,
 )
-from segfloor_ros.core.slam.rig import GATE, MIN_DEPTH_M, NEIGHBOURS, SAME_PX, chi2_limit, in_view
+from segfloor_ros.core.slam.rig import GATE, NEIGHBOURS, SAME_PX, chi2_limit, in_view
 from segfloor_ros.core.slam.sparse_map import (
     LINK_SIGMA,
     LOOP_FACTOR,
@@ -42,8 +37,9 @@ from segfloor_ros.core.slam.sparse_map import (
     SparseMap,
     features_of,
     loop_sigma,
+    median_depth_m,
 )
-from segfloor_ros.core.slam.thresholds import ENOUGH, PROOF, SAME
+from segfloor_ros.core.slam.thresholds import ENOUGH, PROOF
 from segfloor_ros.core.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels
 from segfloor_ros.core.twists import is_within
 
@@ -89,7 +85,7 @@ class LoopDetector:
 
     def reset(self) -> None:
         """Believe in no loop."""
-        self._matcher.reset()
+        self._matcher.sightings.reset()
 
     def detect(self, keyframe: KeyframeRecord, images: Pixels) -> list[Match]:
         """Return the keyframes that see a place again, once there are enough of them, else none."""
@@ -107,11 +103,7 @@ class LoopDetector:
             objection = 'no drift' if is_no_drift(keyframe, seen[0]) else seen[1].objection
             self._note(seen[0], objection or 'seen')
             seen = None if objection else seen
-        if not self._matcher.add(seen):
-            return []
-        matches = self._matcher.matches
-        self.reset()
-        return matches
+        return self._matcher.sightings.add(seen)
 
     def _note(self, match: Match, verdict: str) -> None:
         place = self._map.keyframes[match.place]
@@ -120,7 +112,7 @@ class LoopDetector:
 
     def _linked(self, keyframe: KeyframeRecord) -> NDArray[np.bool_]:
         """Return which keyframes (K,) a view is linked to already."""
-        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        own = keyframe.seen_ids
         linked, shared = self._map.covisible(own)
         near = np.arange(len(self._map.keyframes)) > keyframe.index - NEIGHBOURS
         near[linked[shared > max(ENOUGH, ALIKE_SHARE * len(own))]] = True
@@ -178,8 +170,8 @@ def is_no_drift(keyframe: KeyframeRecord, match: Match) -> bool:
 
 
 class PlaceMatcher:
-    """Matches keyframes with the places of a known map, which may be their own, until enough of
-    them agree.
+    """Matches keyframes with the places of a known map, which may be their own. sightings: those
+    that agree so far.
     """
 
     def __init__(self, own: SparseMap, known: SparseMap, places: PlaceRecognition) -> None:
@@ -187,16 +179,7 @@ class PlaceMatcher:
         self._camera = own.rig.camera
         self._known = known
         self._places = places
-        self._sightings: Sightings[Match] = Sightings(self.agree, self._newness)
-
-    def reset(self) -> None:
-        """Believe in no place."""
-        self._sightings.reset()
-
-    @property
-    def matches(self) -> list[Match]:
-        """The keyframes that see the place, the latest last."""
-        return self._sightings.views
+        self.sightings: Sightings[Match] = Sightings(self.agree, self._newness)
 
     def look(
         self,
@@ -210,9 +193,10 @@ class PlaceMatcher:
         """
         own_ids, track = self._known.points_of(np.flatnonzero(near)), None
         features = features_of(self._map, keyframe)
-        if self.matches:
-            pose = keyframe.T_camera_world @ drift(self._map, self.matches[-1])
-            depth_m = median_depth_m(self._map, keyframe)
+        before = self.sightings.views
+        if before:
+            pose = keyframe.T_camera_world @ drift(self._map, before[-1])
+            depth_m = median_depth_m(self._map, keyframe.seen_ids, keyframe.T_camera_world)
             around = views_near(self._known, pose, depth_m, len(may_show))
             ids = self._places.points_of(around[may_show[around]][:NEIGHBOURS], own_ids)
             track = self._places.confirm(images, features, ids, pose)
@@ -261,7 +245,7 @@ class PlaceMatcher:
         """Return what a keyframe says for a match. A floor alone could be anywhere in a map: there
         it counts no more than what stands around.
         """
-        around = np.inf if self._known is self._map else self.around(match)
+        around = self.around(match)
         by_points = len(match.rows) > 0
         return PlaceEvidence(
             look=match.log_ratio if by_points else 0.0,
@@ -273,13 +257,10 @@ class PlaceMatcher:
             level=self.level(match),
         )
 
-    def add(self, seen: tuple[Match, PlaceEvidence] | None) -> bool:
-        """Take in what the next keyframe sees of the place; returns whether that is enough."""
-        return self._sightings.add(seen)
-
     def _newness(self, matches: list[Match]) -> list[float]:
         """Return how new the view of each keyframe is to those before it."""
-        depth_m = median_depth_m(self._map, self._map.keyframes[matches[-1].keyframe])
+        latest = self._map.keyframes[matches[-1].keyframe]
+        depth_m = median_depth_m(self._map, latest.seen_ids, latest.T_camera_world)
         poses = np.stack([match.T_camera_world for match in matches])
         new = novelty(poses[:, None] @ invert(poses), depth_m)
         return [float(new[k, :k].min(initial=1.0)) for k in range(len(matches))]
@@ -290,16 +271,6 @@ class PlaceMatcher:
         gap = now @ drift(self._map, before) @ invert(latest.T_camera_world)
         sigmas = np.sqrt(2 * chi2_limit(6, GATE)) * LOOP_FACTOR
         return is_within(gap, (sigmas * LINK_SIGMA[0], sigmas * LINK_SIGMA[1]))
-
-    def is_within_reach(self, match: Match) -> bool:
-        """Whether the robot can have come there while it was lost: from the last keyframe of the
-        known map to the first of its own.
-        """
-        first, known = self._map.keyframes[0], self._known.keyframes
-        T_own_known = drift(self._map, match)
-        way = known[-1].T_camera_world @ invert(first.T_camera_world @ T_own_known)
-        lost_s = 1e-9 * (first.stamp_ns - known[-1].stamp_ns)
-        return bool(np.linalg.norm(way[:3, 3]) <= SAME[0] + greatest_speed_mps(known) * lost_s)
 
     def level(self, match: Match) -> float:
         """Return how likely it is that the robot stands as high and as level as at the place."""
@@ -316,29 +287,9 @@ class PlaceMatcher:
 
     def around(self, match: Match) -> float:
         """Return how much likelier what stands around the keyframe stands where the known map has
-        it than in a place beside: floors repeat themselves.
+        it than in a place beside, in nats; infinite within one map, where it is not compared.
         """
-        mount = self._map.rig.mount
-        if mount is None:
-            return 0.0
-        recent = np.arange(max(0, match.keyframe - NEIGHBOURS), match.keyframe + 1)
-        own = upright(self._map, mount, self._map.points_of(recent))
-        own = transform_points(invert(drift(self._map, match)), own)
-        reach_m = np.sqrt(chi2_limit(3)) * LINK_SIGMA[0]
-        along, aside, _ = mount.T_base_left[:3, :3]
-        angles = np.linspace(0.0, 2 * np.pi, 8, endpoint=False)
-        ring = reach_m * (np.outer(np.cos(angles), along) + np.outer(np.sin(angles), aside))
-        shifts = np.concatenate([np.zeros((1, 3)), 4 * ring, 8 * ring, 12 * ring])
-        gaps_m, _ = self._upright.query(own[:, None] + shifts, distance_upper_bound=reach_m)
-        here, *beside = np.isfinite(gaps_m).sum(axis=0)
-        return of_counts(here, max(beside))
-
-    @cached_property
-    def _upright(self) -> cKDTree:
-        """What stands in the known map, once it does not change any more."""
-        assert self._map.rig.mount is not None
-        alive = np.flatnonzero(self._known.alive)
-        return cKDTree(upright(self._known, self._map.rig.mount, alive))
+        return np.inf
 
     def _sides(self, keyframe: KeyframeRecord, match: Match) -> float:
         """Return how much likelier than not the keyframe's own points lie where the place's
@@ -361,8 +312,7 @@ class PlaceMatcher:
         points of the other: the rays to what is seen are free.
         """
         place = self._known.keyframes[match.place]
-        own = keyframe.point_id[keyframe.point_id != NO_POINT]
-        known = place.point_id[place.point_id != NO_POINT]
+        own, known = keyframe.seen_ids, place.seen_ids
         if self._known is self._map:
             own = np.setdiff1d(own, known)
         in_now = transform_points(keyframe.T_camera_world, self._map.xyz_world[own])
@@ -394,16 +344,3 @@ def drift(sparse_map: SparseMap, match: Match) -> Array:
     """Return the (4, 4) that brings a place's coordinates into those of the keyframe's map."""
     own = sparse_map.keyframes[match.keyframe].T_camera_world
     return invert(own) @ match.T_camera_world
-
-
-def upright(sparse_map: SparseMap, mount: Mount, ids: NDArray[np.integer]) -> Array:
-    """Return those of points (N,), (M, 3), that stand clearly above the floor."""
-    xyz = sparse_map.xyz_world[ids]
-    return xyz[transform_points(mount.T_base_left, xyz)[:, 2] > 4 * UP_SIGMA_M]
-
-
-def median_depth_m(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:
-    """Return the median depth of what a keyframe sees."""
-    ids = keyframe.point_id[keyframe.point_id != NO_POINT]
-    depth = transform_points(keyframe.T_camera_world, sparse_map.xyz_world[ids])[:, 2]
-    return max(float(np.median(depth)), MIN_DEPTH_M) if len(ids) else MIN_DEPTH_M

@@ -26,7 +26,6 @@ from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from segfloor_ros.core.files.arrays import Arrays, joined, split
 from segfloor_ros.core.geometry import Array, invert, transform_points
@@ -34,7 +33,7 @@ from segfloor_ros.core.slam.places.evidence import OF_VIEW, PlaceEvidence, is_en
 from segfloor_ros.core.slam.places.views import COLUMNS, ROWS
 from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap, features_of
-from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, SAME
+from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, SAME, SEARCHED_FRAMES
 from segfloor_ros.core.slam.tracking.evidence import ENOUGH_EVIDENCE
 from segfloor_ros.core.slam.tracking.images import Features, hamming
 from segfloor_ros.core.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels, Tracker
@@ -52,9 +51,6 @@ carried at a walking pace.
 
 BEST_GROUPS = 2
 """Places tried with every frame; one more is tried in turn: words alone are not sure."""
-
-NARROW_SEARCHES = 100
-"""Frames for which only the neighbourhood of a given pose is searched: it may be wrong."""
 
 VIEW_REACH_M = 2.0
 """A view shows a place also from so far before or behind where a keyframe stands."""
@@ -182,9 +178,7 @@ class PlaceRecognition:
 
     def locate(self, images: Pixels, features: Features, ids: NDArray[np.int32]) -> Track | None:
         """Find a camera among points `ids` (N,); None unless it sees them."""
-        observations = self._tracker.pixel_observations(features)
-        tree = cKDTree(features.uv_px)
-        estimate = self._tracker.locate(features, tree, observations, ids)
+        estimate = self._tracker.locate(features, ids)
         if estimate is None:
             return None
         return self.confirm(images, features, ids, estimate.T_camera_world)
@@ -321,15 +315,19 @@ class Sightings(Generic[View]):
         """The views, the latest last."""
         return [view for view, _ in self._seen]
 
-    def add(self, seen: tuple[View, PlaceEvidence] | None) -> bool:
-        """Take in the next view and what it says, None for one that does not see the place; returns
-        whether it is proven.
+    def add(self, seen: tuple[View, PlaceEvidence] | None) -> list[View]:
+        """Take in the next view and what it says, None for one that does not see the place. Returns
+        the views, once, when they prove the place, the latest last, else none.
         """
         if seen is None:
             self._seen = self._seen[1:]
-            return False
+            return []
         self._seen = [*(before for before in self._seen if self._agree(before[0], seen[0])), seen]
-        return is_enough([evidence for _, evidence in self._seen], self._newness(self.views))
+        views = self.views
+        if not is_enough([evidence for _, evidence in self._seen], self._newness(views)):
+            return []
+        self.reset()
+        return views
 
 
 class Relocaliser:
@@ -351,7 +349,7 @@ class Relocaliser:
     def search_near(self, T_world_camera: Array, reach: tuple[float, float]) -> None:
         """Look around a pose (4, 4) alone, for some time or until the camera is found."""
         self._near = T_world_camera, reach
-        self._searches_left = NARROW_SEARCHES
+        self._searches_left = SEARCHED_FRAMES
 
     @property
     def is_narrow(self) -> bool:
@@ -387,9 +385,9 @@ class Relocaliser:
         # Where it is expected, no other place can be meant.
         travel = ENOUGH_EVIDENCE if is_expected or given is not None else 0.0
         evidence = PlaceEvidence(look=self._places.log_ratio(found), travel=travel)
-        if not self._sightings.add(((stamp_ns, found), evidence)):
+        views = self._sightings.add(((stamp_ns, found), evidence))
+        if not views:
             return None
-        views = self._sightings.views
         self.reset()
         self._proof = dict(views)
         return found

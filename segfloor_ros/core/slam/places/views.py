@@ -44,6 +44,7 @@ from segfloor_ros.core.slam.sparse_map import (
 )
 from segfloor_ros.core.slam.thresholds import (
     CHANCE_SHARE,
+    FOUND_SHARE,
     MAJORITY,
     NEARLY_ALL,
     POINTS_PER_KEYFRAME,
@@ -75,9 +76,6 @@ COLUMNS, ROWS = 4, 3
 """Parts of an image, in each of which something is asked for."""
 
 DEPTH_FACTORS = (0.5, 1.0, 2.0)
-
-TRACKED_RATIO = 0.25
-"""Condition A3 as published: a keyframe is due when fewer of the reliable points are tracked."""
 
 MUCH_NEW = 2.5
 """Novelty at which condition A2 does not count frames any more, as where the smaller part of the
@@ -210,7 +208,7 @@ def is_keyframe(view: View, max_frames: int) -> bool:
     due |= view.novelty > MUCH_NEW or view.found_share < MAJORITY
     a1 = view.frames_since >= max_frames and new_view
     a2 = view.mapper_idle and due and new_view
-    a3 = view.num_tracked < TRACKED_RATIO * view.num_reliable
+    a3 = view.num_tracked < FOUND_SHARE * view.num_reliable
     return a1 or a2 or a3
 
 

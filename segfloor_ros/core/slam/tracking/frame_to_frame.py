@@ -24,7 +24,7 @@ from segfloor_ros.core.slam.tracking.images import (
     is_inside,
     match_unguided,
 )
-from segfloor_ros.core.slam.tracking.patch_alignment import guess_disparity, measure_disparity
+from segfloor_ros.core.slam.tracking.patch_alignment import measure_disparities
 from segfloor_ros.core.slam.tracking.pose import (
     ANYWHERE,
     PoseEstimate,
@@ -33,7 +33,7 @@ from segfloor_ros.core.slam.tracking.pose import (
     solve_pnp,
 )
 from segfloor_ros.core.timing import timed
-from segfloor_ros.core.twists import adjoint, without_drift
+from segfloor_ros.core.twists import compounded, without_drift
 
 FEATURES, ITERATIONS = 2000, 5000
 """Corners of an image, wherever they are, and draws of RANSAC: where one match in seven is right,
@@ -100,37 +100,25 @@ class FrameToFrame:
         near = PoseEstimate(np.eye(4), moved.inliers, ANYWHERE, 1.0)
         if not is_proof(moved.evidence(near)):
             return None
-        A = adjoint(moved.T_camera_world)
-        return replace(
-            moved,
-            T_camera_world=moved.T_camera_world @ before_estimate.T_camera_world,
-            covariance=moved.covariance + A @ before_estimate.covariance @ A.T,
+        T_camera_world, covariance = compounded(
+            (before_estimate.T_camera_world, before_estimate.covariance),
+            (moved.T_camera_world, moved.covariance),
         )
+        return replace(moved, T_camera_world=T_camera_world, covariance=covariance)
 
     def _corners(self, frame: StereoFrame, images: Images) -> Features:
         """Return the corners of a frame outside of what is excluded; asked for twice of each."""
         if self._seen is not None and self._seen[0] == frame.stamp_ns:
             return self._seen[1]
-        corners, descriptor = self._orb.detectAndCompute(frame.left, None)
-        if not corners:
-            return Features(np.zeros((0, 2), np.float32), np.zeros(0, np.uint8), NO_DESCRIPTOR)
-        uv_px = cv2.KeyPoint_convert(corners)
-        octave = np.array([corner.octave & 0xFF for corner in corners], np.uint8)
-        features = Features(uv_px, octave, np.asarray(descriptor, np.uint8))
-        features = features.take(np.flatnonzero(~is_inside(images.excluded, uv_px)))
+        features = Features.of(*self._orb.detectAndCompute(frame.left, None))
+        features = features.take(np.flatnonzero(~is_inside(images.excluded, features.uv_px)))
         self._seen = frame.stamp_ns, features
         return features
 
     def _measured(self, frame: StereoFrame, images: Images, features: Features) -> Observations:
         """Return what features (N) measure, freed of the disparity offset."""
-        uvd = np.full((len(features), 3), np.nan)
-        uvd[:, :2] = features.uv_px
-        observations = Observations(uvd, np.full(uvd.shape, SIGMA_FLOW_PX))
-        guess: Array = np.zeros(len(features))
-        if not images.depth_scale:
-            guess = guess_disparity(frame.left, frame.right, uvd[:, :2])
-        rows = np.flatnonzero(np.isfinite(guess))
-        measure_disparity(images, observations, rows, guess[rows], SAME_PX)
+        observations = Observations.of_pixels(features.uv_px, SIGMA_FLOW_PX)
+        measure_disparities(frame, images, observations, np.arange(len(features)))
         return observations.without_offset(self._rig.offset.value_px)
 
 
@@ -156,5 +144,3 @@ def crowded_area_px2(uv_px: Array, whole_px2: float) -> float:
 
 NEAR_PX = 4 * SAME_PX
 """Within which features count as close together."""
-
-NO_DESCRIPTOR = np.zeros((0, 32), np.uint8)

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.model import StereoCamera, is_disparity
+from segfloor_ros.core.camera.model import is_disparity
 from segfloor_ros.core.camera.pixels import Region, union
 from segfloor_ros.core.contracts import NO_POINT, BodySensors, LastPose, StereoFrame
-from segfloor_ros.core.geometry import Array, invert, transform_points
+from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.slam.places.place_recognition import (
     PlaceRecognition,
     Relocaliser,
@@ -26,7 +26,7 @@ from segfloor_ros.core.slam.places.place_recognition import (
 from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
-from segfloor_ros.core.slam.thresholds import MOST, SAME
+from segfloor_ros.core.slam.thresholds import SAME
 from segfloor_ros.core.slam.tracking.evidence import is_proof
 from segfloor_ros.core.slam.tracking.frame_to_frame import FrameToFrame
 from segfloor_ros.core.slam.tracking.images import FeatureExtractor, Features, Images, is_inside
@@ -43,6 +43,9 @@ from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ, refine_pose
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
+
+LIVE_ROWS = 0.6
+"""Share of the rows of an image that must show something: others were not delivered."""
 
 MIN_EXPECTED_SHIFT = 0.004
 """Motion of the picture, in widths per frame, that cannot stop from one frame to the next."""
@@ -66,7 +69,6 @@ class FrontEnd:
         self.places = PlaceRecognition(sparse_map)
         self.is_fixed = False
         self.frames_since_keyframe = self.keyframe_ns = 0
-        self._camera = sparse_map.rig.camera
         self._map = sparse_map
         self.relocaliser = Relocaliser(sparse_map, self.places)
         self.repeats = RepeatCheck()
@@ -90,8 +92,7 @@ class FrontEnd:
         """Go on with a map whose drive was broken off."""
         # A robot that nobody sees goes three standard deviations at most.
         self.motion.resume(last, greatest_speed_mps(self._map.keyframes) / 3)
-        seen = self._map.keyframes[-1].point_id
-        self.local.move_to(seen[seen != NO_POINT], last.T_camera_world)
+        self.local.move_to(self._map.keyframes[-1].seen_ids, last.T_camera_world)
 
     def search_near(self, T_world_camera: Array, reach: tuple[float, float]) -> None:
         """Look for the camera around a pose (4, 4) alone, unless it is tracked there."""
@@ -115,16 +116,11 @@ class FrontEnd:
     @timed
     def fault(self, frame: StereoFrame) -> str:
         """Return why a pair of images cannot be tracked, or ''."""
-        points = self._map.xyz_world[self.follower.seen_ids]
-        motion = self.motion
-        shift = partial(
-            expected_shift,
-            self._camera,
-            points,
-            motion.T_camera_world,
-            motion.predict(frame.stamp_ns),
+        motion, follower = self.motion, self.follower
+        frozen = self.repeats.is_frozen(
+            frame.left,
+            lambda: follower.expected_shift(motion.T_camera_world, motion.predict(frame.stamp_ns)),
         )
-        frozen = self.repeats.is_frozen(frame.left, shift)
         fault = image_fault(frame.left, frame.left if is_disparity(frame.right) else frame.right)
         if frozen and not fault:
             return 'the image is again the one before although the camera was moving'
@@ -170,7 +166,7 @@ class FrontEnd:
         """
         prediction = self.motion.predict(frame.stamp_ns)
         followed = self.follower.follow(images, self.local.point_ids, prediction)
-        if followed is not None and not is_proof(followed.evidence(expected)):
+        if followed is not None and not is_proof(followed.estimate.evidence(expected)):
             followed = None
         reach_px = math.inf if expected is None else self.local.reach_px(expected)
         if followed is not None and followed.fits(expected) and reach_px < WIDE_PX:
@@ -184,8 +180,13 @@ class FrontEnd:
         if found is None and self.motion.state is not TrackingState.TRACKING:
             found = self._relocalise(images, features, frame.stamp_ns)
         found = self._stepped(frame, images) if found is None else found
-        is_lost = self.motion.state.is_lost and found is not None
-        return None if is_lost and not _has_reached(self, found, frame.stamp_ns) else found
+        seen_ns = self.frame_to_frame.stamp_ns
+        if found is not None and self.motion.state.is_lost and seen_ns is not None:
+            # No farther than a robot can have driven since its last frame.
+            way_m = greatest_speed_mps(self._map.keyframes) * 1e-9 * (frame.stamp_ns - seen_ns)
+            step = found.T_camera_world @ invert(self.motion.T_camera_world)
+            found = found if is_within(step, (SAME[0] + way_m, math.inf)) else None
+        return found
 
     def _standing(
         self, images: Images, features: Features, found: Track, expected: PoseEstimate
@@ -246,10 +247,18 @@ class FrontEnd:
         """Return a track with the likeliest pose by images and prior; that of the images where the
         prior contradicts it.
         """
-        prior = track.prior
-        if prior is None or differ(track.estimate, prior):
+        by_images, prior = track.estimate, track.prior
+        if prior is None or differ(by_images, prior):
             return replace(track, prior=None)
-        return replace(track, estimate=_with_prior(self._map, track, prior))
+        # As sure as the patches are.
+        rig = self._map.rig
+        seen = track.observations.without_offset(rig.offset.value_px)
+        seen = seen.with_noise_factor(by_images.noise_factor)
+        points, start = self._map.xyz_world[track.point_ids], by_images.T_camera_world
+        found = refine_pose(rig.camera, start, points, seen, prior, is_noise_known=True)
+        pose, covariance = found.T_camera_world, found.covariance
+        weighed = replace(by_images, T_camera_world=pose, covariance=covariance)
+        return replace(track, estimate=weighed)
 
     def bridge(self, frame: StereoFrame, fault: str) -> None:
         """Go on without the images, where the sensors allow it."""
@@ -311,7 +320,7 @@ class FrontEnd:
                 estimate = PoseEstimate(first, np.zeros(0, bool), sure, 1.0)
                 self.frame_to_frame.see(frame, images, estimate)
             none = np.full(len(features), NO_POINT, np.int32)
-            return ObservedFeatures(features, self.tracker.pixel_observations(features), none)
+            return ObservedFeatures(features, features.observations, none)
         pose = self.motion.T_camera_world
         matched = self.tracker.track_at(
             images, features, self.local.point_ids, pose, track.estimate
@@ -333,26 +342,6 @@ class FrontEnd:
         self.frames_since_keyframe, self.keyframe_ns = 0, keyframe.stamp_ns
 
 
-def _with_prior(sparse_map: SparseMap, track: Track, prior: PoseEstimate) -> PoseEstimate:
-    """Return the pose by what a track shows, as sure as its patches are, and a prior."""
-    by_images, points = track.estimate, sparse_map.xyz_world[track.point_ids]
-    seen = track.observations.without_offset(sparse_map.rig.offset.value_px)
-    seen = seen.with_noise_factor(by_images.noise_factor)
-    start, camera = by_images.T_camera_world, sparse_map.rig.camera
-    found = refine_pose(camera, start, points, seen, prior, is_noise_known=True)
-    return replace(by_images, T_camera_world=found.T_camera_world, covariance=found.covariance)
-
-
-def _has_reached(front_end: FrontEnd, track: Track | None, stamp_ns: int) -> bool:
-    """Whether a camera that was lost can have driven to a pose since its last frame."""
-    seen_ns = front_end.frame_to_frame.stamp_ns
-    if track is None or seen_ns is None:
-        return True
-    way_m = greatest_speed_mps(front_end._map.keyframes) * 1e-9 * (stamp_ns - seen_ns)
-    step = track.T_camera_world @ invert(front_end.motion.T_camera_world)
-    return is_within(step, (SAME[0] + way_m, math.inf))
-
-
 def is_near(T_camera_world: Array, expected: PoseEstimate | None) -> bool:
     """Whether a camera can be at a pose (4, 4). expected: where it is, as far as that is known."""
     return expected is None or not differ(
@@ -370,19 +359,9 @@ def image_fault(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> str:
         if spread < GREY_NOISE:
             return f'{side} image without contrast (mean grey level {mean:.0f})'
         live = (sampled != sampled[:, :1]).any(axis=1)
-        if live.mean() < MOST:
+        if live.mean() < LIVE_ROWS:
             return f'{side} image incomplete: {1 - live.mean():.0%} of its rows are empty'
     return ''
-
-
-def expected_shift(camera: StereoCamera, points: Array, T_then: Array, T_now: Array) -> float:
-    """Return how far the picture of points (N, 3) should have moved between two poses
-    (T_camera_world, (4, 4)), in image widths; 0 without points.
-    """
-    if len(points) == 0:
-        return 0.0
-    then, now = (camera.project(transform_points(T, points))[:, :2] for T in (T_then, T_now))
-    return float(np.median(np.linalg.norm(now - then, axis=1))) / camera.width
 
 
 class RepeatCheck:

@@ -19,8 +19,10 @@ Matching of binary descriptors: guided by a predicted pixel, or without guidance
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,13 +33,13 @@ from segfloor_ros.core.camera.model import StereoCamera, is_disparity
 from segfloor_ros.core.camera.pixels import Region, noise_grey, union
 from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.timing import timed
 
 SIDE_PX = 11
 """Of the patch around a pixel: small enough to be flat, large enough to be distinct."""
 
-LEVELS = 3
 SMALL_WIDTH_PX = 320
 """Width of a shrunk image: for optical flow; half of it shows what moves, a quarter turns."""
 STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.05)
@@ -54,6 +56,11 @@ CELL_SIZE_PX = 16
 NOISY_GREY, CALM_GREY = 4.0, 1.5
 """Of an image with more noise than the first, corners are looked for in one that is smoothed until
 it has the second: else they are those of the noise.
+"""
+
+SIGMA_PIXEL = 0.6
+"""Standard deviation of a corner's position at the finest pyramid level, px; grows with the
+level.
 """
 
 PYRAMID_LEVELS, PYRAMID_SCALE = 8, 1.2
@@ -140,7 +147,6 @@ def follow_pixels(
         start,
         guess,
         winSize=(window_px, window_px),
-        maxLevel=LEVELS,
         criteria=steps,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
@@ -177,8 +183,29 @@ class Features:
     octave: NDArray[np.uint8]
     descriptor: NDArray[np.uint8]
 
+    @staticmethod
+    def of(corners: Sequence[cv2.KeyPoint], descriptor: Any) -> Features:
+        """Return corners and their descriptors as OpenCV has them, None for those of no corners."""
+        if not corners:
+            none = np.zeros((0, 2), np.float32), np.zeros(0, np.uint8)
+            return Features(*none, np.zeros((0, 32), np.uint8))
+        uv_px = np.asarray(cv2.KeyPoint_convert(corners), np.float32).reshape(-1, 2)
+        octave = np.array([corner.octave & 0xFF for corner in corners], np.uint8)
+        return Features(uv_px, octave, np.asarray(descriptor, np.uint8))
+
     def __len__(self) -> int:
         return len(self.uv_px)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Finds what lies near a pixel."""
+        return cKDTree(self.uv_px)
+
+    @property
+    def observations(self) -> Observations:
+        """What they measure before any disparity is known."""
+        scale = PYRAMID_SCALE ** self.octave.astype(np.float64)
+        return Observations.of_pixels(self.uv_px, SIGMA_PIXEL * scale[:, None])
 
     def take(self, rows: NDArray[np.intp]) -> Features:
         """Return the chosen rows."""
@@ -207,16 +234,12 @@ class FeatureExtractor:
             inside = is_inside(excluded, cv2.KeyPoint_convert(corners))
             corners = [corner for corner, out in zip(corners, ~inside, strict=True) if out]
         if not corners:
-            return Features(
-                np.zeros((0, 2), np.float32), np.zeros(0, np.uint8), np.zeros((0, 32), np.uint8)
-            )
+            return Features.of((), None)
         uv = cv2.KeyPoint_convert(corners)
         response = np.array([corner.response for corner in corners], np.float32)
         chosen = spread(uv, response, CELL_SIZE_PX, self._budget)
-        kept, descriptor = self._orb.compute(image, [corners[i] for i in chosen])
-        octave = np.array([corner.octave & 0xFF for corner in kept], np.uint8)
-        uv = np.asarray(cv2.KeyPoint_convert(kept), np.float32).reshape(-1, 2)
-        return Features(self._at_full_resolution(uv, octave, image), octave, np.asarray(descriptor))
+        found = Features.of(*self._orb.compute(image, [corners[i] for i in chosen]))
+        return replace(found, uv_px=self._at_full_resolution(found.uv_px, found.octave, image))
 
     def _at_full_resolution(
         self, uv: NDArray[np.float32], octave: NDArray[np.uint8], image: NDArray[np.uint8]
@@ -285,7 +308,6 @@ def _bits() -> NDArray[np.uint8]:
 
 def match_predicted(
     features: Features,
-    tree: cKDTree,
     predicted_uv_px: NDArray[np.floating],
     predicted_octave: NDArray[np.floating],
     descriptor: NDArray[np.uint8],
@@ -301,7 +323,7 @@ def match_predicted(
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     # A list of ranks, as a single one alone would lose its axis.
     ranks = list(range(1, min(NEIGHBOURS, len(features)) + 1))
-    found = tree.query(predicted_uv_px, k=ranks, distance_upper_bound=radius_px.max())
+    found = features.tree.query(predicted_uv_px, k=ranks, distance_upper_bound=radius_px.max())
     reach, near = (np.asarray(part) for part in found)
     octave = np.append(features.octave.astype(np.float64), -100.0)[near]
     valid = (reach <= radius_px[:, None]) & (np.abs(octave - predicted_octave[:, None]) <= 1.5)

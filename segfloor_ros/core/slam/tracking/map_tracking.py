@@ -12,12 +12,12 @@ from keyframes: errors do not add up from frame to frame.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from segfloor_ros.core.camera.pixels import Region
 from segfloor_ros.core.contracts import NO_POINT
@@ -30,7 +30,7 @@ from segfloor_ros.core.slam.rig import (
     Observations,
     in_view,
 )
-from segfloor_ros.core.slam.sparse_map import Covisible, SparseMap
+from segfloor_ros.core.slam.sparse_map import Covisible, SparseMap, median_depth_m
 from segfloor_ros.core.slam.tracking.evidence import is_proof
 from segfloor_ros.core.slam.tracking.images import (
     PYRAMID_LEVELS,
@@ -54,11 +54,6 @@ from segfloor_ros.core.slam.tracking.patch_alignment import (
 from segfloor_ros.core.slam.tracking.pose import Consensus, PoseEstimate, Searched, solve_pnp
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
-
-SIGMA_PIXEL = 0.6
-"""Standard deviation of a corner's position at the finest pyramid level, px; grows with the
-level.
-"""
 
 NARROW_PX, USUAL_PX, WIDE_PX = 6.0, 15.0, 45.0
 """Search radius around a predicted pixel, at the finest pyramid level: once a pose is known from
@@ -91,15 +86,6 @@ class Tracker:
         self.consensus = Consensus(sparse_map)
         self._map = sparse_map
 
-    def pixel_observations(self, features: Features) -> Observations:
-        """Return the observations of features (N) before any disparity is known."""
-        uvd = np.full((len(features), 3), np.nan)
-        uvd[:, :2] = features.uv_px
-        sigma = np.full((len(features), 3), 1.0)
-        scale = PYRAMID_SCALE ** features.octave.astype(np.float64)
-        sigma[:, :2] = SIGMA_PIXEL * scale[:, None]
-        return Observations(uvd, sigma)
-
     def best(
         self,
         images: Images,
@@ -115,23 +101,23 @@ class Tracker:
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
-        tree = cKDTree(features.uv_px)
-        observations = self.pixel_observations(features)
         best: Track | None = None
+        most = -math.inf
         for start in starts:
-            coarse = self._coarse(features, tree, observations, local_ids, start)
+            coarse = self._coarse(features, local_ids, start)
             if coarse is None:
                 continue
             track = self.track_at(images, features, local_ids, coarse.T_camera_world)
             if track is None:
                 continue
-            proven = is_proof(track.evidence(expected))
+            evidence = track.estimate.evidence(expected)
+            proven = is_proof(evidence)
             is_found_again = best is not None and proven and track.fits(best.estimate)
-            if best is None or track.evidence(expected) > best.evidence(expected):
-                best = track
+            if evidence > most:
+                best, most = track, evidence
             if is_found_again or (start.is_sure and proven and track.fits(expected)):
                 break
-        return best if best is not None and is_proof(best.evidence(expected)) else None
+        return best if is_proof(most) else None
 
     @timed
     def track_at(
@@ -150,12 +136,11 @@ class Tracker:
             return None
         offset_px = self._map.rig.offset.value_px
         if isinstance(images, Images):
-            observations, excluded = self.pixel_observations(features), images.excluded
+            observations, excluded = features.observations, images.excluded
         else:
             observations, excluded = images, None
         seen = predict_points(self._map, local_ids, T_camera_world, excluded)
-        tree = cKDTree(features.uv_px)
-        points, rows, area_px2 = self._search(features, tree, seen, NARROW_PX)
+        points, rows, area_px2 = self._search(features, seen, NARROW_PX)
         if len(rows) == 0:
             return None
         ids = seen.ids[points]
@@ -184,14 +169,12 @@ class Tracker:
             ),
         )
 
-    def locate(
-        self, features: Features, tree: cKDTree, observations: Observations, ids: NDArray[np.int32]
-    ) -> PoseEstimate | None:
+    def locate(self, features: Features, ids: NDArray[np.int32]) -> PoseEstimate | None:
         """Find the pose among map points without a prediction: descriptors alone and PnP-RANSAC for
         a first guess, which then has to find more points where they should be.
         """
         start = self.by_descriptors(features, ids)
-        return None if start is None else self._coarse(features, tree, observations, ids, start)
+        return None if start is None else self._coarse(features, ids, start)
 
     def by_descriptors(self, features: Features, ids: NDArray[np.int32]) -> Start | None:
         """Return the pose that most of the map points `ids` (N,) agree with whose descriptors are
@@ -203,39 +186,29 @@ class Tracker:
         return None if found is None else Start(found[0])
 
     def _coarse(
-        self,
-        features: Features,
-        tree: cKDTree,
-        observations: Observations,
-        local_ids: NDArray[np.int32],
-        start: Start,
+        self, features: Features, local_ids: NDArray[np.int32], start: Start
     ) -> PoseEstimate | None:
         """Return the pose by the features around a start; None where there is no evidence."""
         seen = predict_points(self._map, local_ids, start.T_camera_world)
-        points, rows, area_px2 = self._search(features, tree, seen, start.radius_px)
+        points, rows, area_px2 = self._search(features, seen, start.radius_px)
         if len(rows) == 0:
             return None
         missed, by_chance = len(seen.ids) - len(rows), min(start.radius_px * FOUND_PER_PX, 1.0)
         searched = Searched(area_px2, None, missed, by_chance)
         found = self.consensus.refine(
-            start.T_camera_world, seen.ids[points], observations.take(rows), searched
+            start.T_camera_world, seen.ids[points], features.observations.take(rows), searched
         )
         return found if is_proof(found.evidence()) else None
 
     def _search(
-        self, features: Features, tree: cKDTree, seen: Prediction, radius_px: float
+        self, features: Features, seen: Prediction, radius_px: float
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
         """Return pairs of points (N,) and features (N,) and the areas (N,) they were looked for
         in.
         """
         reach_px = radius_px * PYRAMID_SCALE ** np.clip(seen.octave, 0, None)
         points, rows = match_predicted(
-            features,
-            tree,
-            seen.uvd_px[:, :2],
-            seen.octave,
-            self._map.descriptor[seen.ids],
-            reach_px,
+            features, seen.uvd_px[:, :2], seen.octave, self._map.descriptor[seen.ids], reach_px
         )
         return points, rows, np.pi * reach_px[points] ** 2
 
@@ -340,7 +313,7 @@ class LocalMap:
         """Whether a frame shows enough that is new. frames_since, since_ns: since the last one."""
         covisible = self._covisible(track.point_ids)
         reference = self._map.keyframes[covisible[0][0]]
-        known = reference.point_id[reference.point_id != NO_POINT]
+        known = reference.seen_ids
         reliable = known[self._map.observer_count[known] > 1]
         depth_m = self._median_depth(reliable if len(reliable) else known, track.T_camera_world)
         novelty = view_novelty(self._map, track.point_ids, track.T_camera_world, depth_m, covisible)
@@ -370,8 +343,7 @@ class LocalMap:
     def _median_depth(self, ids: NDArray[np.int32], T_camera_world: Array) -> float:
         """Return the depth of points `ids` (N,); without any, that of those seen last."""
         if len(ids):
-            depth = transform_points(T_camera_world, self._map.xyz_world[ids])[:, 2]
-            self._depth_m = max(float(np.median(depth)), MIN_DEPTH_M)
+            self._depth_m = median_depth_m(self._map, ids, T_camera_world)
         return self._depth_m
 
 
@@ -400,7 +372,7 @@ def align_pixels(
 
 
 class Follower:
-    """Finds the pose of a frame from the one before."""
+    """Finds the pose of a frame from the one before. seen_ids: points (N,) that this one showed."""
 
     def __init__(self, sparse_map: SparseMap) -> None:
         self._map = sparse_map
@@ -411,27 +383,34 @@ class Follower:
     def reset(self) -> None:
         """Know no frame before."""
         self._small: NDArray[np.uint8] | None = None
-        self._ids: NDArray[np.int32] = np.zeros(0, np.int32)
+        self.seen_ids: NDArray[np.int32] = np.zeros(0, np.int32)
         self._uv_px: Array = np.zeros((0, 2))
 
     def see(self, images: Images, ids: NDArray[np.int32], uv_px: Array) -> None:
         """Take in a frame that shows map points `ids` (N,) at pixels (N, 2)."""
-        self._small, self._ids, self._uv_px = images.small, ids, uv_px
+        self._small, self.seen_ids, self._uv_px = images.small, ids, uv_px
 
-    @property
-    def seen_ids(self) -> NDArray[np.int32]:
-        """The points (N,) of the last frame."""
-        return self._ids
+    def expected_shift(self, T_then: Array, T_now: Array) -> float:
+        """Return how far the picture of these points should have moved between two poses
+        (T_camera_world, (4, 4)), in image widths; 0 without points.
+        """
+        points = self._map.xyz_world[self.seen_ids]
+        if len(points) == 0:
+            return 0.0
+        then, now = (
+            self._camera.project(transform_points(T, points))[:, :2] for T in (T_then, T_now)
+        )
+        return float(np.median(np.linalg.norm(now - then, axis=1))) / self._camera.width
 
     def drop_inside(self, region: Region) -> None:
         """Forget the points that the last frame shows in a region."""
         outside = ~is_inside(region, self._uv_px)
-        self._ids, self._uv_px = self._ids[outside], self._uv_px[outside]
+        self.seen_ids, self._uv_px = self.seen_ids[outside], self._uv_px[outside]
 
     def drop_dead(self) -> None:
         """Forget points that are not part of the map any more."""
-        alive = self._map.alive[self._ids]
-        self._ids, self._uv_px = self._ids[alive], self._uv_px[alive]
+        alive = self._map.alive[self.seen_ids]
+        self.seen_ids, self._uv_px = self.seen_ids[alive], self._uv_px[alive]
 
     def follow(
         self, images: Images, local_ids: NDArray[np.int32], T_predicted: Array
@@ -460,10 +439,10 @@ class Follower:
     @timed
     def _by_flow(self, images: Images, T_predicted: Array) -> PoseEstimate | None:
         """Find the pose to about a pixel from where the last frame's points went."""
-        if self._small is None or len(self._ids) == 0:
+        if self._small is None or len(self.seen_ids) == 0:
             return None
-        step = -(-len(self._ids) // MAX_FOLLOWED)
-        ids, uv_last = self._ids[::step], self._uv_px[::step]
+        step = -(-len(self.seen_ids) // MAX_FOLLOWED)
+        ids, uv_last = self.seen_ids[::step], self._uv_px[::step]
         points = transform_points(T_predicted, self._map.xyz_world[ids])
         front = points[:, 2] > MIN_DEPTH_M
         ids, uv_last, points = ids[front], uv_last[front], points[front]
@@ -475,8 +454,7 @@ class Follower:
         found &= ~is_inside(images.excluded, uv)
         if not found.any():
             return None
-        uvd = np.column_stack([uv[found], np.full(int(found.sum()), np.nan)])
-        observations = Observations(uvd, np.full(uvd.shape, SIGMA_FLOW_PX))
+        observations = Observations.of_pixels(uv[found], SIGMA_FLOW_PX)
         searched = Searched(float(SIDE_PX * width / self._small.shape[1]) ** 2)
         roughly = self._consensus.refine(T_predicted, ids[found], observations, searched)
         return roughly if is_proof(roughly.evidence()) else None

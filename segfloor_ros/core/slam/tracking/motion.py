@@ -10,7 +10,14 @@ from segfloor_ros.core.contracts import BodySensors, LastPose, RelativeMotion
 from segfloor_ros.core.geometry import Array, invert, make_transform
 from segfloor_ros.core.slam.thresholds import SAME, SPEED_SIGMA
 from segfloor_ros.core.slam.tracking.pose import ANYWHERE, PoseEstimate, knows_more
-from segfloor_ros.core.twists import adjoint, is_within, se3_exp, se3_log, without_drift
+from segfloor_ros.core.twists import (
+    Uncertain,
+    compounded,
+    is_within,
+    se3_exp,
+    se3_log,
+    without_drift,
+)
 
 MIN_STEP_S = 1e-3
 
@@ -124,13 +131,11 @@ class CameraMotion:
         if self.state.is_lost:
             return self._expected_lost(stamp_ns)
         measured = self.measured(stamp_ns)
-        predicted = self._predicted(measured)
-        if measured is None or predicted is None:
-            steady = self.predict(stamp_ns)
-            goes_on = self._surprises.covariance(step_s)
-            moved = RelativeMotion(steady @ invert(self.T_camera_world), goes_on)
-            return _estimate(*_moved((self.T_camera_world, self.covariance), moved))
-        pose, covariance = predicted[0], predicted[1].copy()
+        if measured is None:
+            motion = self.steady(stamp_ns) @ invert(self.T_camera_world)
+            goes_on = motion, self._surprises.covariance(step_s)
+            return _estimate(*compounded((self.T_camera_world, self.covariance), goes_on))
+        pose, covariance = self._predicted(measured)
         if not measured.by_wheels:
             covariance[:3, :3] += (SPEED_SIGMA * step_s) ** 2 * np.eye(3)
         return _estimate(pose, covariance)
@@ -195,9 +200,8 @@ class CameraMotion:
         correction of `odom`.
         """
         measured = self.measured(stamp_ns)
-        predicted = self._predicted(measured)
-        if self.state.is_blind and predicted is not None:
-            T_odom_camera = invert(predicted[0] @ self.T_world_odom)
+        if self.state.is_blind and measured is not None:
+            T_odom_camera = invert(self._predicted(measured)[0] @ self.T_world_odom)
             self.T_world_odom = without_drift(invert(T_camera_world) @ invert(T_odom_camera))
         motion = se3_log(T_camera_world @ invert(self.T_camera_world))
         steady = not (self.state.is_lost or self.state.is_blind)
@@ -222,16 +226,16 @@ class CameraMotion:
         measure it.
         """
         measured = self.measured(stamp_ns)
-        predicted = self._predicted(measured)
-        if measured is None or predicted is None:
+        if measured is None or self.state.is_lost:
             return False
+        pose, covariance = self._predicted(measured)
         if measured.source == 'nothing':
-            self.covariance, self.state = predicted[1], TrackingState.HELD
+            self.covariance, self.state = covariance, TrackingState.HELD
             return True
-        if not measured.by_wheels and sigma_m(predicted[1]) > SAME[0]:
+        if not measured.by_wheels and sigma_m(covariance) > SAME[0]:
             return False
         self.since_keyframe.add(measured)
-        self.T_camera_world, self.covariance = without_drift(predicted[0]), predicted[1]
+        self.T_camera_world, self.covariance = without_drift(pose), covariance
         self._last_stamp_ns = stamp_ns
         self.state = TrackingState(f'on {measured.source}')
         R_world_odom = self.T_world_odom[:3, :3]
@@ -292,14 +296,13 @@ class CameraMotion:
             return None
         return make_transform(turn[0], np.zeros(3)) @ self.T_camera_world, turn[1]
 
-    def _predicted(self, measured: RelativeMotion | None) -> tuple[Array, Array] | None:
-        """Return where the sensors have the camera after a motion (4, 4), and the covariance."""
-        if measured is None or self.state.is_lost:
-            return None
+    def _predicted(self, measured: RelativeMotion) -> Uncertain:
+        """Return where the sensors have the camera after a motion, while it is not lost."""
         covariance = self.covariance
         if self._broken_off is not None and self.state.is_resuming:
             covariance = self._broken_off[0].covariance
-        return _moved((self.T_camera_world, covariance), measured)
+        before = self.T_camera_world, covariance
+        return compounded(before, (measured.T_now_before, measured.covariance))
 
 
 class Surprises:
@@ -347,27 +350,19 @@ class KeyframeMotion:
             T_now_keyframe = T_camera_world @ invert(self.T_camera_world)
             self.motion = RelativeMotion(T_now_keyframe, covariance, 'images')
 
-    def moved(self, measured: RelativeMotion) -> tuple[Array, Array] | None:
+    def moved(self, measured: RelativeMotion) -> Uncertain | None:
         """Return the pose after the motion by wheels so far and one of a frame, with covariance."""
         if self.motion is None or not self.motion.by_wheels:
             return None
-        return _moved((self.T_camera_world, self.covariance), joined_motion(self.motion, measured))
+        motion = joined_motion(self.motion, measured)
+        before = self.T_camera_world, self.covariance
+        return compounded(before, (motion.T_now_before, motion.covariance))
 
 
 def joined_motion(first: RelativeMotion, later: RelativeMotion) -> RelativeMotion:
-    """Return the motion over two stretches (Barfoot 2017, section 7.3.3, to second order)."""
-    A = adjoint(later.T_now_before)
-    return RelativeMotion(
-        later.T_now_before @ first.T_now_before,
-        A @ first.covariance @ A.T + later.covariance,
-        later.source if first.by_wheels else first.source,
-    )
-
-
-def _moved(before: tuple[Array, Array], motion: RelativeMotion) -> tuple[Array, Array]:
-    """Return a pose (4, 4) and its covariance (6, 6) after a motion."""
-    A = adjoint(motion.T_now_before)
-    return motion.T_now_before @ before[0], A @ before[1] @ A.T + motion.covariance
+    """Return the motion over two stretches."""
+    both = ((motion.T_now_before, motion.covariance) for motion in (first, later))
+    return RelativeMotion(*compounded(*both), later.source if first.by_wheels else first.source)
 
 
 def _estimate(T_camera_world: Array, covariance: Array) -> PoseEstimate:

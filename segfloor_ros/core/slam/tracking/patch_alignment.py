@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.pixels import SUBPIXEL, disparity_at
+from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.slam.rig import MAX_DISPARITY_SHARE, Observations
+from segfloor_ros.core.slam.rig import MAX_DISPARITY_SHARE, SAME_PX, Observations
 from segfloor_ros.core.slam.thresholds import MAJORITY
 from segfloor_ros.core.slam.tracking.images import SIDE_PX, SMALL_WIDTH_PX, Images
 from segfloor_ros.core.timing import timed
@@ -39,8 +40,8 @@ GREY_NOISE = 2.0
 """Standard deviation of a grey level that the camera alone explains; a lower residual is luck, and
 an image that varies by less shows nothing."""
 
-ALIGNED_PX, MAX_SHIFT_STEP_PX = 2.0, 1.0
-"""From so far away a patch is brought to where it lies, by no more than this in one step."""
+ALIGNED_PX = 2.0
+"""From so far away a patch is brought to where it lies, by no more than half of it in one step."""
 
 MIN_SIGMA_PIXEL, MIN_SIGMA_DISPARITY = 0.15, 0.1
 """No patch is measured better: lenses, rectification and the shape of things are not perfect."""
@@ -51,7 +52,7 @@ MIN_TEXTURE = 5
 MIN_CORRELATION = 0.7
 """Of the patches of one point in both images."""
 
-MAX_STEP = np.array([MAX_SHIFT_STEP_PX, AFFINE_SIGMA, AFFINE_SIGMA])[:, None]
+MAX_STEP = np.array([ALIGNED_PX / 2, AFFINE_SIGMA, AFFINE_SIGMA])[:, None]
 
 Patches = NDArray[np.float32]
 
@@ -372,6 +373,17 @@ def measure_disparity(
         disparity, sigma = refine_disparity(images.left, images.right, uv_px, guess_px, reach_px)
     observations.uvd_px[rows, 2] = disparity
     observations.sigma_px[rows, 2] = np.clip(sigma, MIN_SIGMA_DISPARITY, None)
+
+
+def measure_disparities(
+    frame: StereoFrame, images: Images, observations: Observations, rows: NDArray[np.intp]
+) -> None:
+    """Set, in place, the disparities of observations `rows` (N,), wherever they are found."""
+    guess: Array = np.zeros(len(rows))
+    if not images.depth_scale:
+        guess = guess_disparity(frame.left, frame.right, observations.uvd_px[rows, :2])
+    found = np.isfinite(guess)
+    measure_disparity(images, observations, rows[found], guess[found], SAME_PX)
 
 
 def refine_disparity(

@@ -19,18 +19,15 @@ from numpy.typing import NDArray
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import UNKNOWN_COVARIANCE
 from segfloor_ros.core.geometry import Array, invert, make_transform, transform_points
-from segfloor_ros.core.least_squares import SHRINK, minimise
+from segfloor_ros.core.least_squares import SHRINK, SMALLEST, minimise
 from segfloor_ros.core.slam.rig import (
     MAX_DISPARITY_SHARE,
     MIN_DEPTH_M,
     SAME_PX,
-    SMALLEST,
     Observations,
     huber_cost,
     huber_weights,
     is_gated,
-    residuals,
-    squared_norms,
 )
 from segfloor_ros.core.slam.sparse_map import SparseMap
 from segfloor_ros.core.slam.thresholds import PROOF
@@ -199,8 +196,7 @@ def refine_pose(
     for _ in range(ROUNDS):
         state = _State(pose, seen.take(inliers), known)
         pose = minimise(state, STEPS_PER_ROUND, CONVERGED).pose
-        rays, _, chi2 = seen.at(pose)
-        chi2[rays[2] >= 1 / MIN_DEPTH_M] = 1e12
+        rays, chi2 = seen.distances(pose)
         start = 1.0 if is_noise_known else math.sqrt(max(1.0, float(np.median(chi2 / seen.median))))
         mixture = Mixture.fit(
             chi2, seen.dimensions, log_chance, start, searched.missed, searched.largest_factor
@@ -240,19 +236,6 @@ class _Prior:
         error = se3_log(T_camera_world @ self.T_world_camera)
         gradient = self.information @ error
         return gradient, float(error @ gradient)
-
-
-def squared_distances(
-    camera: StereoCamera, pose: Array, points_world: Array, observations: Observations
-) -> Array:
-    """Return the squared, normalised residuals (N,) of observations of points (N, 3) at a pose;
-    infinite for points behind the camera.
-    """
-    points = transform_points(pose, points_world)
-    front = points[:, 2] > MIN_DEPTH_M
-    points[~front] = (0.0, 0.0, 1.0)
-    chi2 = squared_norms(residuals(camera, points, observations), observations.information)
-    return np.where(front, chi2, np.inf)
 
 
 @dataclass(frozen=True)
@@ -313,6 +296,14 @@ class _Seen:
         residual = rays * self.rows[3:6]
         residual -= self.rows[6:9]
         return rays, residual, np.einsum('an,an->n', residual, residual)
+
+    def distances(self, T_camera_world: Array) -> tuple[Array, Array]:
+        """Return the rays (3, N) and the squared residuals (N,) of `at`; what is behind the camera
+        fits nothing.
+        """
+        rays, _, chi2 = self.at(T_camera_world)
+        chi2[rays[2] >= 1 / MIN_DEPTH_M] = 1e12
+        return rays, chi2
 
     def jacobian(self, rays: Array, root: Array | float) -> Array:
         """Return the derivatives (6, 3 N) of what is seen along rays (3, N) by the twist of the
@@ -465,8 +456,8 @@ class _Problem:
 
     def fitting(self, T_camera_world: Array, noise_factor: float) -> NDArray[np.bool_]:
         """Return which observations (N,) fit a pose."""
-        chi2 = squared_distances(self.camera, T_camera_world, self.points, self.observations)
-        return np.asarray(chi2 <= noise_factor**2 * self.observations.chi2_limit)
+        seen = _Seen.of(self.camera, self.points, self.observations)
+        return np.asarray(seen.distances(T_camera_world)[1] <= noise_factor**2 * seen.limit)
 
 
 def differ(a: PoseEstimate, b: PoseEstimate) -> bool:

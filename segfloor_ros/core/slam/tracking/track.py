@@ -73,10 +73,6 @@ class Track:
         """The covariance (6, 6) of the pose's twist."""
         return self.estimate.covariance
 
-    def evidence(self, expected: PoseEstimate | None) -> float:
-        """Return the evidence for the pose. expected: where the camera was to be."""
-        return self.estimate.evidence(expected)
-
     def fits(self, expected: PoseEstimate | None) -> bool:
         """Whether the camera is where it was expected."""
         return expected is None or not differ(self.estimate, expected)

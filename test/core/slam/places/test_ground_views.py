@@ -10,6 +10,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from segfloor_ros.core.files.results import from_bytes, to_bytes
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.plugins.assembly import equipped_slam
+from segfloor_ros.core.plugins.maps.known_map import KnownPlaces
 from segfloor_ros.core.plugins.maps.saved_slam import load_slam, save_slam
 from segfloor_ros.core.slam.places.loops import PlaceMatcher
 from segfloor_ros.core.slam.places.views import GroundViews, motion_between
@@ -183,7 +184,7 @@ def test_a_keyframe_that_looks_like_another_place_than_its_floor_does_counts_for
         return Match(keyframe.index, 0, keyframe.T_camera_world, *nothing)
 
     monkeypatch.setattr(PlaceMatcher, 'look', looks_like_the_start)
-    monkeypatch.setattr(PlaceMatcher, 'around', lambda *_: 20.0)
+    monkeypatch.setattr(KnownPlaces, 'around', lambda *_: 20.0)
     monkeypatch.setattr(PlaceMatcher, '_free', lambda *_: 0.0)
     slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     load_slam(slam, CAMERA, there[1], 'there.map')

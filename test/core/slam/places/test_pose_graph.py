@@ -34,11 +34,10 @@ def graph(poses, loops, robust):
     i, j = np.arange(1, COUNT), np.arange(COUNT - 1)
     T = np.concatenate([poses[i] @ invert(poses[j]), np.stack([T for _, _, T in loops])])
     i, j = np.append(i, [a for a, _, _ in loops]), np.append(j, [b for _, b, _ in loops])
-    fixed = np.arange(COUNT) == 0
     sigma = np.tile([0.01] * 3 + [0.002] * 3, (len(i), 1))
     is_robust = np.zeros(len(i), bool)
     is_robust[COUNT - 1 :] = robust
-    return PoseGraph(poses, fixed, i, j, T, sigma, is_robust)
+    return PoseGraph(poses, i, j, T, sigma, is_robust)
 
 
 def errors_m(poses, truth):

@@ -4,7 +4,6 @@ import math
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.tracking import images
@@ -56,19 +55,16 @@ def test_a_single_feature_is_matched_by_the_point_it_shows():
     seen = features([[50, 50]])
     near = np.array([[200.0, 200.0], [52.0, 51.0], [90.0, 50.0]])
     wanted = np.concatenate([descriptors(1, 7), seen.descriptor, descriptors(1, 8)])
-    points, rows = match_predicted(
-        seen, cKDTree(seen.uv_px), near, np.zeros(3), wanted, np.full(3, 15.0)
-    )
+    points, rows = match_predicted(seen, near, np.zeros(3), wanted, np.full(3, 15.0))
     np.testing.assert_array_equal(points, [1])
     np.testing.assert_array_equal(rows, [0])
 
 
 def test_predicted_matches_need_nearness_and_a_clear_winner():
     seen = features([[50, 50], [60, 50], [200, 200]])
-    tree = cKDTree(seen.uv_px)
     near = np.array([[52.0, 51.0], [150.0, 150.0]])
     wanted = seen.descriptor[[0, 2]]
-    points, rows = match_predicted(seen, tree, near, np.zeros(2), wanted, np.full(2, 15.0))
+    points, rows = match_predicted(seen, near, np.zeros(2), wanted, np.full(2, 15.0))
     np.testing.assert_array_equal(points, [0])
     np.testing.assert_array_equal(rows, [0])
     # Two features alike but for a few bits, both at a small distance: nothing shows which it is.
@@ -77,16 +73,15 @@ def test_predicted_matches_need_nearness_and_a_clear_winner():
     twin[0, 0] ^= 0xFF
     twin[1, 1] ^= 0xFF
     twins = Features(seen.uv_px, seen.octave, twin)
-    points, _ = match_predicted(twins, tree, near, np.zeros(2), wanted, np.full(2, 15.0))
+    points, _ = match_predicted(twins, near, np.zeros(2), wanted, np.full(2, 15.0))
     assert len(points) == 0
 
 
 def test_predicted_matches_respect_the_pyramid_level():
     seen = features([[50, 50]], octave=[4])
-    tree = cKDTree(seen.uv_px)
     at, radius = np.array([[50.0, 50.0]]), np.array([15.0])
-    assert len(match_predicted(seen, tree, at, np.array([4.0]), seen.descriptor, radius)[0]) == 1
-    assert len(match_predicted(seen, tree, at, np.array([1.0]), seen.descriptor, radius)[0]) == 0
+    assert len(match_predicted(seen, at, np.array([4.0]), seen.descriptor, radius)[0]) == 1
+    assert len(match_predicted(seen, at, np.array([1.0]), seen.descriptor, radius)[0]) == 0
 
 
 def test_unguided_matches_are_mutual_and_bounded():

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 from segfloor_ros.core.contracts import FrameResult, LastPose, Mount
-from segfloor_ros.core.slam import session as sessions
+from segfloor_ros.core.plugins.maps import session as sessions
+from segfloor_ros.core.plugins.maps.session import HARDLY_BEGUN, LOST_NS, MapSession
+from segfloor_ros.core.slam import session as core
 from segfloor_ros.core.slam.held_results import HeldResults
-from segfloor_ros.core.slam.session import HARDLY_BEGUN, LOST_NS, MapSession, SessionState
+from segfloor_ros.core.slam.rig import NO_OFFSET
+from segfloor_ros.core.slam.session import SessionState
 
 MAPPING, RESUMED, LOADED = SessionState.MAPPING, SessionState.RESUMED, SessionState.LOADED
 BESIDE, OUTSIDE, LOST = SessionState.BESIDE, SessionState.OUTSIDE, SessionState.LOST
@@ -34,23 +37,33 @@ class Parts:
         self.known.find.return_value = None, {}
         self.known.recognise.return_value = False
         self.back_end = MagicMock()
-        self.back_end.keeper.hold.return_value = self.known
+        self.back_end.follow = lambda change: change()
+        self.hold, self.to_arrays = MagicMock(return_value=self.known), MagicMock(return_value={})
+        monkeypatch.setattr(sessions, 'KnownMap', self.hold)
+        monkeypatch.setattr(sessions, 'map_and_words', self.to_arrays)
+        monkeypatch.setattr(sessions, 'fill_map', MagicMock())
+        self.known.to_arrays.return_value = {}
+        mount = Mount(0.3, 0.0, 0.0)
         self.map = SimpleNamespace(
-            keyframes=[None] * keyframes, rig=SimpleNamespace(mount=Mount(0.3, 0.0, 0.0))
+            keyframes=[None] * keyframes,
+            rig=SimpleNamespace(
+                mount=mount, base_mount=mount, offset=SimpleNamespace(estimate=NO_OFFSET)
+            ),
         )
         self.sensors, self.moving, self.mount_search = MagicMock(), MagicMock(), MagicMock()
-        self.session = MapSession(
+        self.parts = core.Parts(
             self.map,
             self.front_end,
             self.back_end,
             self.sensors,
             self.moving,
             self.mount_search,
-            HeldResults(),
+            HeldResults(self.map.rig),
         )
+        self.session = MapSession(self.parts)
         self.now_ns = 0
         if is_loaded:
-            self.session.load(last)
+            self.session.load({sessions.OFFSET: np.zeros(2)}, last)
             self.motion.state.is_resuming = last is not None
 
     def frame(self, is_tracked: bool = False, fault: str = '') -> list[FrameResult]:
@@ -116,7 +129,7 @@ def test_a_camera_that_is_lost_long_enough_begins_a_submap(make):
     for _ in range(LOST_NS // STEP_NS):
         assert len(parts.frame()) == 1 and parts.session.state is MAPPING
     assert parts.frame() == [] and parts.session.state is LOST
-    assert parts.back_end.keeper.hold.call_args.args[-1]  # of this drive
+    assert parts.hold.call_args.args[-1]  # of this drive
     parts.sensors.reset_world.assert_not_called()
 
 
@@ -137,7 +150,8 @@ def test_what_interrupts_a_search_starts_the_time_anew(make, what):
 def test_no_submap_begins_where_none_may(make, why):
     parts = make()
     parts.front_end.is_fixed = why == 'localize'
-    parts.back_end.keeper.can_hold = why != 'nothing kept'
+    if why == 'nothing kept':
+        parts.session = core.OneMap(parts.parts)
     parts.lose()
     assert parts.session.state is MAPPING
     parts.back_end.reset.assert_not_called()
@@ -148,7 +162,7 @@ def test_a_map_that_had_hardly_begun_is_dropped(make):
     parts.lose()
     assert parts.session.state is MAPPING
     parts.back_end.reset.assert_called_once()
-    parts.back_end.keeper.hold.assert_not_called()
+    parts.hold.assert_not_called()
 
 
 def test_a_submap_that_is_recognised_joins_the_map(lost):
@@ -156,7 +170,7 @@ def test_a_submap_that_is_recognised_joins_the_map(lost):
     lost.known.recognise.return_value = True
     assert lost.session.join(MagicMock(), MagicMock())
     assert lost.session.state is MAPPING and lost.session.is_public is False
-    lost.back_end.merge.assert_called_once_with(lost.known)
+    lost.known.merge.assert_called_once()
     ready = lost.frame(is_tracked=True)
     assert len(ready) == 5 and all(r.tracked for r in ready)
     assert lost.session.is_public
@@ -168,7 +182,7 @@ def test_a_submap_in_which_the_camera_is_lost_again_is_dropped(lost, is_seen):
     lost.known.find.return_value = (object() if is_seen else None), {}
     ready = lost.frame() if is_seen else lost.lose()
     assert lost.session.state is MAPPING
-    lost.back_end.restore.assert_called_once_with(lost.known)
+    lost.known.restore.assert_called_once()
     assert len(ready) > 4 and ready[0].in_submap and not ready[0].tracked
 
 
@@ -186,15 +200,17 @@ def test_at_the_end_the_larger_of_map_and_submap_stays(lost, may_replace, more):
     is_kept = bool(may_replace and more)
     assert lost.session.state is MAPPING
     assert [r.tracked for r in rest] == [is_kept] * 4
-    assert lost.back_end.restore.called is not is_kept
+    assert lost.known.restore.called is not is_kept
 
 
 def test_the_map_for_a_file_is_the_known_one_while_results_are_held(lost):
-    lost.session.to_arrays()
-    lost.back_end.to_arrays.assert_called_with(lost.known)
+    lost.to_arrays.reset_mock()
+    lost.known.to_arrays.return_value = {'of': 'the known one'}
+    assert lost.session.to_arrays()['of'] == 'the known one'
+    lost.to_arrays.assert_not_called()
     lost.session.search_near(np.eye(4), (1.0, 1.0))
-    lost.session.to_arrays()
-    lost.back_end.to_arrays.assert_called_with(None)
+    assert 'of' not in lost.session.to_arrays()
+    lost.to_arrays.assert_called_once()
 
 
 def test_a_submap_begins_beside_a_loaded_map_with_the_first_frame(make):
@@ -202,7 +218,7 @@ def test_a_submap_begins_beside_a_loaded_map_with_the_first_frame(make):
     parts.frame(fault='dark')
     assert parts.session.state is LOADED
     assert parts.frame(is_tracked=True) == [] and parts.session.state is BESIDE
-    assert not parts.back_end.keeper.hold.call_args.args[-1]
+    assert not parts.hold.call_args.args[-1]
     parts.motion.reset.assert_called_once()
     parts.sensors.reset_world.assert_called_once()
 
@@ -211,7 +227,7 @@ def test_a_frame_that_is_found_in_the_loaded_map_drops_the_submap(beside):
     beside.known.find.return_value = object(), {}
     ready = beside.frame()
     assert beside.session.state is MAPPING
-    beside.back_end.restore.assert_called_once_with(beside.known)
+    beside.known.restore.assert_called_once()
     assert [r.tracked for r in ready] == [False] * 3 + [True]
     assert not any(r.in_submap for r in ready)
 
