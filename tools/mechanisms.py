@@ -12,7 +12,8 @@ from unittest import mock
 import numpy as np
 
 from segfloor_ros.core.configuration import Configuration
-from segfloor_ros.core.floor.mask.filling import fill_regions, fill_to_contact, upright_above
+from segfloor_ros.core.floor.mask.filling import fill_regions, fill_to_contact
+from segfloor_ros.core.floor.mask.pixel_evidence import upright_above
 
 ROOM = 'segfloor_ros.'
 NOTHING = 'nothing'
@@ -72,18 +73,8 @@ def _above_anything(view: Any, disparity: Any, compared: Any, textured: Any) -> 
     return upright_above(view, disparity, compared, np.ones_like(textured))
 
 
-def _filled_whatever_stands(
-    view: Any,
-    mask: Any,
-    slope: Any,
-    upright_px: Any,
-    compared: Any,
-    textured: Any,
-    standing: Any,
-    *others: Any,
-) -> Any:
-    shapes = view, mask, slope, upright_px, compared, textured
-    return fill_regions(*shapes, _nowhere(standing), *others)
+def _filled_whatever_stands(frame: Any, mask: Any, standing: Any, *others: Any) -> Any:
+    return fill_regions(frame, mask, _nowhere(standing), *others)
 
 
 def _begun_anywhere(view: Any, mask: Any, alike: Any, may_begin: Any, *others: Any) -> Any:
@@ -180,7 +171,7 @@ FLOOR: dict[str, Mechanism] = {
         {'core.floor.mask.filling.fill_to_contact': _begun_anywhere}
     ),
     'contacts with what has texture alone': Mechanism(
-        {'core.floor.segmentation.upright_above': _above_anything}
+        {'core.floor.mask.pixel_evidence.upright_above': _above_anything}
     ),
     'feet of blank faces': Mechanism(
         {'core.floor.segmentation.blank_feet': lambda *_: (np.zeros(0, np.float32), _no_rows())}
@@ -189,7 +180,7 @@ FLOOR: dict[str, Mechanism] = {
     'noise stands nowhere': Mechanism({'core.floor.segmentation._LEAST_SHARE': 0.0}),
     'boards count twice': Mechanism({'core.floor.segmentation._BOARD': 1}),
     'filling of regions': Mechanism(
-        {'core.floor.segmentation.fill_regions': lambda view, mask, *_: mask}
+        {'core.floor.segmentation.fill_regions': lambda frame, mask, *_: mask}
     ),
     'filling of gaps': Mechanism(
         {'core.floor.segmentation.fill_gaps': lambda view, profile, mask, *_: mask}
@@ -211,7 +202,11 @@ FLOOR: dict[str, Mechanism] = {
         {'core.floor.segmentation.beside_something': lambda view, mask: _nowhere(mask)}
     ),
     'floor beside the profile': Mechanism(
-        {'core.floor.segmentation.lies_on_floor': lambda view, disparity, _: _nowhere(disparity)}
+        {
+            'core.floor.mask.pixel_evidence.lies_on_floor': lambda view, disparity, _: _nowhere(
+                disparity
+            )
+        }
     ),
     'what stands is not filled': Mechanism(
         {'core.floor.segmentation.fill_regions': _filled_whatever_stands}

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.camera.pixels import SUBPIXEL, shrunk
+from segfloor_ros.core.camera.pixels import SUBPIXEL, shrunk, shrunk_image
 from segfloor_ros.core.contracts import RANGE_MAX_ERROR_M, SAME_SURFACE_SHARE, FloorScan, Mount
 from segfloor_ros.core.floor.disparity.matching import (
     COARSE_BLOCK_PX,
@@ -24,7 +24,8 @@ from segfloor_ros.core.floor.disparity.matching import (
     SPECKLE_PX,
     DisparityMatcher,
 )
-from segfloor_ros.core.floor.mask.pixel_evidence import texture_grey
+from segfloor_ros.core.floor.disparity.profile import histogram
+from segfloor_ros.core.floor.pair import Pair, texture_grey
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.geometry import Array, transform_points
 
@@ -234,12 +235,11 @@ class FloorScanner:
         """Return how many points (2, M) lie at every bearing in bins of the same share of the
         range.
         """
-        n, m = self._count, len(self._log_bins)
+        shape = self._count, len(self._log_bins)
         ranges = np.maximum(np.hypot(xy[0], xy[1]), _NEAREST_M)
         bins = (np.log(ranges * (1 / _NEAREST_M)) * (1 / _LOG_STEP)).astype(np.intp)
-        near = bins < m
-        cell = self._bearing_index(xy[:, near]) * m + bins[near]
-        return np.bincount(cell, minlength=n * m).reshape(n, m)
+        near = bins < shape[1]
+        return histogram(self._bearing_index(xy[:, near]), bins[near], shape)
 
 
 def _median_bin(total: NDArray[np.int32], begin: NDArray[np.intp], end: NDArray[np.intp]) -> Array:
@@ -284,49 +284,35 @@ class OverheadMatcher:
         searched = math.ceil(nearest_px / (_SCALE * SUBPIXEL)) * SUBPIXEL
         self._matcher = DisparityMatcher(searched, COARSE_BLOCK_PX, SPECKLE_PX // _SCALE**2)
 
-    def positions(
-        self,
-        left: NDArray[np.uint8],
-        right: NDArray[np.uint8],
-        mount: Mount,
-        horizon_row: int,
-        min_texture_grey: float,
-        moving: NDArray[np.uint8] | None = None,
-        measured: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:
-        """Return where in the base's x-y plane something is in the way, (2, N), by the rows above
-        `horizon_row` of a rectified pair (H, W); every fourth pixel at most tells.
-
-        mount: of this frame. min_texture_grey: what a disparity needs to mean something. moving:
-        mask (H, W), 255 where what stands there moves and does not count. measured: disparity
-        (H, W) of a depth camera.
+    def positions(self, pair: Pair, mount: Mount) -> NDArray[np.float32]:
+        """Return where in the base's x-y plane something is in the way, (2, N), by the rows of a
+        pair above those that can show floor; every fourth pixel at most tells. mount: of this
+        frame.
         """
-        camera = self._camera
+        camera, horizon_row = self._camera, pair.first_row
         reach = (self._settings.robot_height_m - mount.height_m) / _SEEN_BEFORE_M * camera.fy
         first = max(0, horizon_row - int(max(reach, 0.0))) // _SCALE * _SCALE
         last = first + (horizon_row - first) // _SCALE * _SCALE
         if last - first < RUN_UP_ROWS:
             return np.zeros((2, 0), np.float32)
-        size = (camera.width // _SCALE, (last - first) // _SCALE)
-        halves = [
-            cv2.resize(image[first:last], size, interpolation=cv2.INTER_AREA)
-            for image in (left, right)
-        ]
-        if measured is None:
-            disparity = self._matcher.compute(halves[0], halves[1])
+        rows = slice(first, last)
+        left, right = (shrunk_image(image[rows], _SCALE) for image in (pair.left, pair.right))
+        size = left.shape[::-1]
+        if pair.measured is None:
+            disparity = self._matcher.compute(left, right)
             # A slope along the row gets steeper as the image gets smaller.
-            textured = texture_grey(halves[0], _TEXTURE_WINDOW_PX) > _SCALE * min_texture_grey
+            textured = texture_grey(left, _TEXTURE_WINDOW_PX) > _SCALE * pair.enough
             known = (disparity > 0) & ~_fringes(disparity)
             certain = _with_boards(disparity, known, known & textured)
         else:
-            disparity = shrunk(measured[first:last], size)
+            disparity = shrunk(pair.measured[rows], size)
             certain = disparity > 0
-        if moving is not None:
-            certain &= cv2.resize(moving[first:last], size, interpolation=cv2.INTER_NEAREST) == 0
-        rows, columns = np.nonzero(certain)
-        disparity_px = _SCALE * disparity[rows, columns].astype(np.float64)
+        if pair.moving is not None:
+            certain &= cv2.resize(pair.moving[rows], size, interpolation=cv2.INTER_NEAREST) == 0
+        v, u = np.nonzero(certain)
+        disparity_px = _SCALE * disparity[v, u].astype(np.float64)
         centre = 0.5 * (_SCALE - 1)
-        uv_px = np.stack([_SCALE * columns + centre, _SCALE * rows + first + centre], axis=1)
+        uv_px = np.stack([_SCALE * u + centre, _SCALE * v + first + centre], axis=1)
         return self.in_the_way(uv_px, disparity_px, mount)
 
     def in_the_way(self, uv_px: Array, disparity_px: Array, mount: Mount) -> NDArray[np.float32]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera, is_disparity
-from segfloor_ros.core.camera.pixels import SUBPIXEL, seen_from_right
+from segfloor_ros.core.camera.pixels import SUBPIXEL, seen_from_right, shrunk_image
 from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.geometry import Array
 
@@ -142,26 +142,6 @@ class DisparityMatcher:
         return disparity
 
 
-def halved_disparity(
-    matcher: DisparityMatcher, left: NDArray[np.uint8], right: NDArray[np.uint8]
-) -> NDArray[np.float32]:
-    """Return the disparities (H, W) of a pair, matched at half its resolution; 0 where there is no
-    match.
-    """
-    height, width = (size // 2 for size in left.shape)
-    halves = [
-        cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
-        for image in (left, right)
-    ]
-    disparity = np.zeros(left.shape, np.float32)
-    disparity[: 2 * height, : 2 * width] = cv2.resize(
-        2 * matcher.compute(halves[0], halves[1]),
-        (2 * width, 2 * height),
-        interpolation=cv2.INTER_NEAREST,
-    )
-    return disparity
-
-
 def refined(
     left: NDArray[np.uint8],
     right: NDArray[np.uint8],
@@ -239,7 +219,10 @@ class TwoScaleMatcher:
         """
         if self._coarse is None:
             return self._fine.compute(left, right)
-        disparity = halved_disparity(self._coarse, left, right)
+        found = self._coarse.compute(*(shrunk_image(image, 2) for image in (left, right)))
+        found = 2 * found.repeat(2, axis=0).repeat(2, axis=1)
+        disparity = np.zeros(left.shape, np.float32)
+        disparity[: found.shape[0], : found.shape[1]] = found
         if fine_rows == 0:
             return disparity
         part = slice(0, fine_rows + _RUN_OUT_ROWS)

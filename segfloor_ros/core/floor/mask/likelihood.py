@@ -80,14 +80,12 @@ _LOOK_NATS = -4.0, 3.0
 class Seen:
     """What is known of each pixel.
 
-    first_row: of the image. floor_px, disparity_px: disparity of the floor, and the matched one, 0
-    where none is. slope: of a floor's disparity, per row of the image. texture: as many times of
-    what is surely no noise. lower: bool, what lies deeper than a robot may drop. grey: brightness,
-    smoothed. costs: None of a depth camera. noise_grey: of the images. is_floor: bool, what is
-    floor so far.
+    floor_px, disparity_px: disparity of the floor, and the matched one, 0 where none is. slope: of
+    a floor's disparity, per row of the image. texture: as many times of what is surely no noise.
+    lower: bool, what lies deeper than a robot may drop. grey: brightness, smoothed. costs: None of
+    a depth camera. noise_grey: of the images. is_floor: bool, what is floor so far.
     """
 
-    first_row: int
     floor_px: Picture
     disparity_px: Picture
     slope: float

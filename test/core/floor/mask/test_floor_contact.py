@@ -6,8 +6,8 @@ from floor_scenes import CAMERA, MOUNT
 
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.floor.disparity.profile import FloorLine, FloorProfile, FloorView
-from segfloor_ros.core.floor.mask.filling import fill_to_contact, upright_above
-from segfloor_ros.core.floor.mask.pixel_evidence import Comparison
+from segfloor_ros.core.floor.mask.filling import fill_to_contact
+from segfloor_ros.core.floor.mask.pixel_evidence import Comparison, upright_above
 
 FIRST_ROW = 200
 SEEN_ROW, CONTACT_ROW = 160, 80  # of the view: floor is seen from the one, a wall up to the other

@@ -31,7 +31,6 @@ def ground(seed: int = 0) -> Seen:
     matched_px = floor_px + rng.normal(0, 0.5, SHAPE)
     costs = Costs(*np.full((2, *SHAPE), 1.2, np.float32), np.ones(SHAPE, np.float32))
     return Seen(
-        first_row=0,
         floor_px=floor_px,
         disparity_px=matched_px.astype(np.float32),
         slope=SLOPE,
