@@ -12,7 +12,7 @@ from unittest import mock
 import numpy as np
 
 from segfloor_ros.core.configuration import Configuration
-from segfloor_ros.core.floor.mask.filling import fill_regions, fill_to_contact
+from segfloor_ros.core.floor.mask.filling import fill_to_contact
 from segfloor_ros.core.floor.mask.pixel_evidence import upright_above
 
 ROOM = 'segfloor_ros.'
@@ -71,10 +71,6 @@ def _nowhere(like: Any, *_: object) -> Any:
 
 def _above_anything(view: Any, disparity: Any, compared: Any, textured: Any) -> Any:
     return upright_above(view, disparity, compared, np.ones_like(textured))
-
-
-def _filled_whatever_stands(frame: Any, mask: Any, standing: Any, *others: Any) -> Any:
-    return fill_regions(frame, mask, _nowhere(standing), *others)
 
 
 def _begun_anywhere(view: Any, mask: Any, alike: Any, may_begin: Any, *others: Any) -> Any:
@@ -209,7 +205,11 @@ FLOOR: dict[str, Mechanism] = {
         }
     ),
     'what stands is not filled': Mechanism(
-        {'core.floor.segmentation.fill_regions': _filled_whatever_stands}
+        {
+            'core.floor.mask.pixel_evidence.Heights.standing': property(
+                lambda self: _nowhere(self.height)
+            )
+        }
     ),
     'trimming to edges': Mechanism({'core.floor.segmentation.trim_to_edges': _first}),
     'what hangs at the height of the robot': Mechanism(

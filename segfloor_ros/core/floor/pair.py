@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.pixels import noise_grey
+from segfloor_ros.core.camera.model import is_disparity
+from segfloor_ros.core.camera.pixels import noise_grey, seen_from_right
 from segfloor_ros.core.contracts import NO_EVIDENCE
-from segfloor_ros.core.floor.disparity.matching import stereo_view
+from segfloor_ros.core.floor.disparity.matching import equal_exposure
 from segfloor_ros.core.floor.disparity.profile import STEP_PX
 
 _SIGMA_PX = 2.0
@@ -59,7 +60,8 @@ class Pair:
         part: tuple[slice, slice],
     ) -> Pair:
         """Return a pair, or an image and its disparity, with the texture of its part."""
-        right, measured = stereo_view(left, right)
+        measured = np.nan_to_num(right, nan=0.0) if is_disparity(right) else None
+        right = equal_exposure(left, right) if measured is None else seen_from_right(left, right)
         left_rows = left[part[0]]
         noise = noise_grey(left_rows)
         enough = enough_texture(noise)
@@ -79,11 +81,6 @@ class Pair:
     def left_rows(self) -> NDArray[np.uint8]:
         """Whole rows of the left image, (R, image width)."""
         return self.left[self.part[0]]
-
-    @property
-    def right_rows(self) -> NDArray[np.uint8]:
-        """Whole rows of the right image, (R, image width)."""
-        return self.right[self.part[0]]
 
     @cached_property
     def textured(self) -> NDArray[np.bool_]:

@@ -59,7 +59,9 @@ _BOARD_SHARE = 0.04
 
 
 class FloorScanner:
-    """Makes the scans of one camera on one mount."""
+    """Makes the scans of one camera on one mount. cells_xy: where it looks for floor, (2, N) in the
+    base's x-y plane: at every bearing in turn all ranges.
+    """
 
     def __init__(
         self, camera: StereoCamera, mount: Mount, settings: FloorSegmentationSettings
@@ -87,14 +89,7 @@ class FloorScanner:
         bearings = self._angle_min + step * np.arange(self._count)
         directions = np.stack([np.cos(bearings), np.sin(bearings)])
         cells = directions[:, :, None] * self._middle
-        self._cells_xy = cells.reshape(2, -1).astype(np.float32)
-
-    @property
-    def cells_xy(self) -> NDArray[np.float32]:
-        """Where the scan looks for floor, (2, N) in the base's x-y plane: at every bearing in
-        turn all ranges.
-        """
-        return self._cells_xy
+        self.cells_xy: NDArray[np.float32] = cells.reshape(2, -1).astype(np.float32)
 
     def scan(
         self,
@@ -169,10 +164,6 @@ class FloorScanner:
             limit: Array = 1 / near
         return limit
 
-    def _tolerance(self, range_m: Array) -> Array:
-        """Return how long a gap in the floor may be at a range."""
-        return np.maximum(self._gap_m, _GAP_ROWS * self._row_m(range_m))
-
     def _row_m(self, range_m: Array) -> Array:
         """Return how much floor one image row shows at a range."""
         return range_m**2 / (self._height_m * self._camera.fy)
@@ -186,7 +177,8 @@ class FloorScanner:
         last = np.maximum.accumulate(np.where(seen, middle, 0.0), axis=1)
         previous = np.concatenate([np.zeros((self._count, 1)), last[:, :-1]], axis=1)
         previous = np.maximum(previous, self._nearest[:, None])
-        broken = seen & (middle - previous > self._tolerance(middle))
+        tolerated = np.maximum(self._gap_m, _GAP_ROWS * self._row_m(middle))
+        broken = seen & (middle - previous > tolerated)
         unbroken = np.cumsum(broken, axis=1) == 0
         return np.where(seen & unbroken & may_end, middle, 0.0).max(axis=1)
 
@@ -258,15 +250,9 @@ def _floor_on_border(camera: StereoCamera, mount: Mount) -> Array:
     """Return where the rays along the image's left, right and lower border meet the floor, (N, 2)
     in the base's x-y plane.
     """
-    columns = np.arange(camera.width, dtype=np.float64)
-    rows = np.arange(camera.height, dtype=np.float64)
-    uv = np.concatenate(
-        [
-            np.stack([columns, np.full(camera.width, camera.height - 1.0)], 1),
-            np.stack([np.zeros(camera.height), rows], 1),
-            np.stack([np.full(camera.height, camera.width - 1.0), rows], 1),
-        ]
-    )
+    columns, rows = np.arange(camera.width), np.arange(camera.height)
+    borders = (columns, rows[-1]), (columns[0], rows), (columns[-1], rows)
+    uv = np.hstack([np.broadcast_arrays(*border) for border in borders]).T.astype(np.float64)
     T_base_left = mount.T_base_left
     rays = camera.back_project(uv, np.ones(len(uv))) @ T_base_left[:3, :3].T
     rays = rays[rays[:, 2] < -1e-3]

@@ -23,13 +23,7 @@ from segfloor_ros.core.contracts import (
     FloorScan,
     Mount,
 )
-from segfloor_ros.core.floor.disparity.matching import (
-    BLOCK_PX,
-    MEAN_NOISE,
-    SIGMAS,
-    TwoScaleMatcher,
-    disparity_range,
-)
+from segfloor_ros.core.floor.disparity.matching import BLOCK_PX, TwoScaleMatcher, disparity_range
 from segfloor_ros.core.floor.disparity.profile import (
     BINS_PER_PX,
     STEP_PX,
@@ -54,11 +48,11 @@ from segfloor_ros.core.floor.mask.likelihood import Likelihood, Seen
 from segfloor_ros.core.floor.mask.look import unlike_floor
 from segfloor_ros.core.floor.mask.painting import with_floor, without_floor
 from segfloor_ros.core.floor.mask.pixel_evidence import (
-    Evidence,
     FloorFrame,
+    Heights,
     below_floor,
+    compare,
     judge,
-    mean_height,
 )
 from segfloor_ros.core.floor.pair import Pair
 from segfloor_ros.core.floor.plane.plane import PROVED, Fixture, expectations, plane_of_frame
@@ -96,9 +90,6 @@ class FloorSegmentation:
         self._border = BlankBorder()
         self._mount: Mount | None = None
         self.fixture = Fixture()
-        self._matcher: TwoScaleMatcher
-        self._overhead: OverheadMatcher
-        self._scanner: FloorScanner
 
     def process(
         self,
@@ -137,11 +128,13 @@ class FloorSegmentation:
             counted = filtered_v_disparity(view, below, clear, searched, BINS_PER_PX)
             profile = fit_profile(counted, view.line, self._camera)
         with measure('comparison'):
-            frame = FloorFrame.of(view, profile, pair, below, searched, self._settings)
+            heights = Heights.of(view, profile, pair, below, searched, self._settings)
+            compared = compare(view, profile, pair, below, heights)
+            frame = FloorFrame(view, profile, pair, below, heights, compared)
         with measure('evidence'):
-            evidence = _evidence(frame, self._settings.step_height_m)
+            judged, odd = _judged(frame, self._settings.step_height_m)
         with measure('filling'):
-            mask = self._fill(frame, evidence)
+            mask = self._fill(frame, judged, odd)
         with measure('likelihood'):
             mask = drop_islands(self.likelihood.weighed(mask, _seen(frame, mask)))
             if not is_shown:
@@ -151,14 +144,14 @@ class FloorSegmentation:
             hanging_xy = self._overhead.positions(pair, view.mount)
         with measure('scan'):
             movable_xy = None if movable is None else self._positions(view, movable)
-            scan = self._scan(frame, evidence, mask, hanging_xy, movable_xy)
+            scan = self._scan(frame, judged, mask, hanging_xy, movable_xy)
         if movable is not None:
             disparity = np.maximum(disparity, movable)
         rows = np.arange(self._camera.height)
         return FloorObservation(
             disparity_px=disparity,
             mask=_whole(view, mask),
-            profile_px=profile.at_rows(rows),
+            profile_px=profile.at_rows(rows).astype(np.float64),
             scan=scan,
             max_disparity_px=max(float(searched), float(disparity.max())),
             v_disparity=counted,
@@ -237,21 +230,23 @@ class FloorSegmentation:
         disparity[top:] = self._matcher.compute(pair.left[top:], pair.right[top:], fine_rows)
         return disparity
 
-    def _fill(self, frame: FloorFrame, evidence: Evidence) -> NDArray[np.uint8]:
+    def _fill(
+        self, frame: FloorFrame, judged: NDArray[np.uint8], looks_odd: NDArray[np.bool_]
+    ) -> NDArray[np.uint8]:
         """Return the mask with floor where this pair of images alone cannot tell: where it looks
         like floor. The more floor is known the better is known how it looks, so this is done twice,
         and what then does not look like it is floor only if it was measured. Nor does it contradict
         a network that was right so far.
         """
         view, pair, consistent = frame.view, frame.pair, frame.compared.consistent
-        mask, odd = evidence.mask, evidence.odd
+        mask, odd, off = judged, looks_odd, frame.heights.mean_off
         beside = beside_something(view, mask)
         for _ in range(2):
-            mask = fill_regions(frame, mask, evidence.standing, beside, odd)
+            mask = fill_regions(frame, mask, beside, odd)
             mask = fill_gaps(view, frame.profile, mask, consistent & ~(beside | odd))
             unlike = unlike_floor(pair.left[pair.part], mask == FLOOR)
-            odd = unlike & (evidence.off | evidence.odd)
-            mask = without_floor(mask, unlike & evidence.off & pair.textured)
+            odd = unlike & (off | looks_odd)
+            mask = without_floor(mask, unlike & off & pair.textured)
         if pair.said_there is not None:
             self.network.note(pair.said_there, mask)
             if self.network.is_trusted:
@@ -261,16 +256,18 @@ class FloorSegmentation:
     def _scan(
         self,
         frame: FloorFrame,
-        evidence: Evidence,
+        judged: NDArray[np.uint8],
         mask: NDArray[np.uint8],
         hanging_xy: NDArray[np.float32],
         movable_xy: NDArray[np.float32] | None,
     ) -> FloorScan:
-        """Return the scan. hanging_xy, movable_xy: (2, N), what is in the way above the horizon,
+        """Return the scan. judged, mask: (R, W), before and after what is blank was filled.
+        hanging_xy, movable_xy: (2, N), what is in the way above the horizon,
         and what is of a class that moves.
         """
-        view = frame.view
-        rows, columns = pixels_where((evidence.mask[::2] == NOT_FLOOR) & evidence.above[::2])
+        view, pair = frame.view, frame.pair
+        above = (frame.heights.height > 0) & (pair.texture >= _LEAST_SHARE * pair.enough)
+        rows, columns = pixels_where(((judged == NOT_FLOOR) & above)[::2])
         rows *= 2
         upright_xy = view.positions(rows, columns, frame.disparity_px[rows, columns])
         v, u, floor_px = view.pixels_of_profile(self._scanner.cells_xy, frame.profile)
@@ -293,23 +290,22 @@ class FloorSegmentation:
         return self._overhead.in_the_way(uv_px.astype(float), at.astype(float), view.mount)
 
 
-def _evidence(frame: FloorFrame, step_m: float) -> Evidence:
-    """Return what the pixels (R, W) of a frame say by themselves, cut back to edges, and left open
-    where they do not look like floor and are not measured to lie on it; and what a network says
-    stands there. step_m: what a robot climbs.
+def _judged(frame: FloorFrame, step_m: float) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Return a mask (R, W) of what the pixels of a frame say by themselves, cut back to edges, and
+    left open where they do not look like floor and are not measured to lie on it; and of what a
+    network says stands there; and what does not look like floor (R, W). step_m: what a robot
+    climbs.
     """
-    pair, heights = frame.pair, frame.heights
+    pair = frame.pair
     mask = trim_to_edges(judge(frame, step_m), pair.slope)
-    odd, sigmas = unlike_floor(pair.left[pair.part], mask == FLOOR), mean_height(heights)
-    off, standing = np.abs(sigmas) > SIGMAS * MEAN_NOISE, sigmas > SIGMAS
+    odd = unlike_floor(pair.left[pair.part], mask == FLOOR)
     doubtful = (mask == FLOOR) & odd
     mask = without_floor(mask, doubtful)
-    mask = with_floor(mask, doubtful & ~off & below_floor(mask))
+    mask = with_floor(mask, doubtful & ~frame.heights.mean_off & below_floor(mask))
     mask = pair.without_hidden(mask)
     if pair.said_there is not None:
         mask[pair.said_there == NOT_FLOOR] = NOT_FLOOR
-    above = (heights.height > 0) & (pair.texture >= _LEAST_SHARE * pair.enough)
-    return Evidence(mask, above, off, standing, odd)
+    return mask, odd
 
 
 def _seen(frame: FloorFrame, mask: NDArray[np.uint8]) -> Seen:
@@ -323,8 +319,8 @@ def _seen(frame: FloorFrame, mask: NDArray[np.uint8]) -> Seen:
         texture=pair.texture[half] / pair.enough,
         lower=(heights.off & ~heights.above)[half],
         grey=grey.astype(np.float32),
-        costs=compared.costs,
-        noise_grey=pair.noise_grey,
+        better=compared.better,
+        noise_grey=pair.noise_grey if pair.measured is None else 0.0,
         is_floor=mask[half] == FLOOR,
     )
 

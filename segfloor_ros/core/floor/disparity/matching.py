@@ -8,14 +8,13 @@ disparities are large, and an error of twice as many pixels is still a small sha
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.model import StereoCamera, is_disparity
-from segfloor_ros.core.camera.pixels import SUBPIXEL, seen_from_right, shrunk_image
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.pixels import SUBPIXEL, shrunk_image
 from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.geometry import Array
 
@@ -82,17 +81,6 @@ def equal_exposure(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray
         return right
     adapted = right.astype(np.float32) * np.float32(gain) + np.float32(offset)
     return np.clip(np.rint(adapted), 0, 255).astype(np.uint8)
-
-
-def stereo_view(
-    left: NDArray[np.uint8], right: NDArray[Any]
-) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None]:
-    """Return the right image (H, W), as bright as the left one, and None; of a depth camera, which
-    has a disparity in its place, what a right camera would see, and the disparity, 0 for holes.
-    """
-    if not is_disparity(right):
-        return equal_exposure(left, right), None
-    return seen_from_right(left, right), np.nan_to_num(right, nan=0.0)
 
 
 class DisparityMatcher:

@@ -52,6 +52,8 @@ _WIDE_PX = 480
 
 STEP_PX = 2
 """Every so many pixels of the image, in rows and columns, are compared, and filled, alike."""
+_BEYOND_ROWS = 1e5
+"""No floor is seen so far below the image."""
 _NEAR_M, _FAR_M = 0.05, 1000.0
 """Depths are between these."""
 
@@ -118,14 +120,17 @@ class FloorProfile:
     disparity_px: Array
     support: float
 
+    @cached_property
+    def _nodes(self) -> tuple[Array, Array]:
+        """Rows and disparities between which the profile is straight; it goes on as the line."""
+        rows = self.first_row + np.arange(len(self.disparity_px) + 1.0)
+        rows[-1] += _BEYOND_ROWS
+        last_px = self.disparity_px[-1] + self.line.slope * (rows[-1] - rows[-2])
+        return rows, np.append(self.disparity_px, last_px)
+
     def at_rows(self, rows: Array | NDArray[np.integer]) -> Array:
-        """Return the floor's disparity at de-rolled rows, NaN above the first row."""
-        row = np.asarray(rows, np.float64)
-        end = self.first_row + len(self.disparity_px) - 1
-        grid = self.first_row + np.arange(len(self.disparity_px))
-        values = np.interp(row, grid, self.disparity_px)
-        values += np.maximum(row - end, 0) * self.line.slope
-        profile: Array = np.where(row < self.first_row, np.nan, values).astype(np.float64)
+        """Return the floor's disparity at de-rolled rows (…), NaN above the first row."""
+        profile: Array = np.interp(rows, *self._nodes, left=np.nan)
         return profile
 
     def at_pixels(self, derolled: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -138,13 +143,12 @@ class FloorProfile:
         share = offset - index.astype(np.float32)
         return by_row[index] * (1 - share) + by_row[index + 1] * share
 
-    def row_of_disparity(self, disparity_px: NDArray[np.floating]) -> Array:
+    def row_of_disparity(self, disparity_px: Array) -> Array:
         """Return the de-rolled row at which the floor has a disparity."""
-        d = np.asarray(disparity_px, np.float64)
-        grid = self.first_row + np.arange(len(self.disparity_px))
-        rows = np.interp(d, self.disparity_px, grid)
-        rows += np.maximum(d - self.disparity_px[-1], 0) / self.line.slope
-        return rows - np.maximum(self.disparity_px[0] - d, 0) / self.line.slope
+        rows, nodes_px = self._nodes
+        before_px = np.maximum(nodes_px[0] - disparity_px, 0)
+        row: Array = np.interp(disparity_px, nodes_px, rows) - before_px / self.line.slope
+        return row
 
 
 def spline_basis(positions: NDArray[np.floating]) -> Array:
@@ -206,15 +210,10 @@ def _prior_information(prior: Array, line: FloorLine, camera: StereoCamera) -> A
 
     The pitch shifts the line, the height scales it.
     """
-    ends = np.array([0, _CONTROLS - 1])
     jacobian = np.zeros((2, _CONTROLS))
-    jacobian[0, ends[0]] = 1.0
-    jacobian[1, ends] = (-1.0, 1.0)
-    sigma = np.array(
-        [line.slope * camera.fy * PITCH_SIGMA_RAD, HEIGHT_SIGMA * float(prior[-1] - prior[0])]
-    )
-    scaled = jacobian / sigma[:, None]
-    return scaled.T @ scaled
+    jacobian[0, 0] = 1 / (line.slope * camera.fy * PITCH_SIGMA_RAD)
+    jacobian[1, [0, -1]] = np.array([-1.0, 1.0]) / (HEIGHT_SIGMA * (prior[-1] - prior[0]))
+    return jacobian.T @ jacobian
 
 
 def pixels_where(picture: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -257,11 +256,6 @@ class FloorView:
         """Every other row and column of the image, as a part of the view."""
         return np.s_[::STEP_PX, :: STEP_PX // self.step]
 
-    @cached_property
-    def plane_px(self) -> NDArray[np.float32]:
-        """Disparity (R, W) of a floor that does not bend."""
-        return np.float32(self.line.slope) * (self.derolled - np.float32(self.line.horizon))
-
     def positions(
         self,
         rows: NDArray[np.number],
@@ -278,7 +272,7 @@ class FloorView:
 
     def pixels_of_profile(
         self, xy_base: NDArray[np.float32], profile: FloorProfile
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.floating]]:
         """Return the view's rows and columns (N,) of positions (2, N) on the floor as it bends,
         and its disparity there (N,); negative columns where they are behind the camera.
         """

@@ -66,21 +66,16 @@ measured."""
 
 
 def fill_regions(
-    frame: FloorFrame,
-    mask: NDArray[np.uint8],
-    standing: NDArray[np.bool_],
-    beside: NDArray[np.bool_],
-    odd: NDArray[np.bool_],
+    frame: FloorFrame, mask: NDArray[np.uint8], beside: NDArray[np.bool_], odd: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
     """Return the mask with NO_EVIDENCE turned to floor in regions that look alike and continue
     floor.
 
-    standing: (R, W), what is measured above the floor. beside, odd: (R, W), where no region goes
-    on: `beside_something`, and what does not look like floor. A region is bounded by edges of the
-    image stronger than most of the floor's own; floor by evidence must be in a share of its
-    columns. In it a pixel becomes floor below floor, the next evidence up its column; or between
-    floor on its left and right; or, if it is not blank and not measured above the floor, nearer
-    than any of its floor.
+    beside, odd: (R, W), where no region goes on: `beside_something`, and what does not look like
+    floor. A region is bounded by edges of the image stronger than most of the floor's own; floor by
+    evidence must be in a share of its columns. In it a pixel becomes floor below floor, the next
+    evidence up its column; or between floor on its left and right; or, if it is not blank and not
+    measured above the floor, nearer than any of its floor.
     """
     half, slope = frame.view.half, frame.pair.picture_slope
     small = mask[half]
@@ -99,7 +94,7 @@ def fill_regions(
     not_blank = cv2.erode(frame.pair.textured[half].astype(np.uint8), margin)
     rows = np.arange(small.shape[0], dtype=np.float32)[:, None]
     inside = (highest < small.shape[0]) & alike & (small == NO_EVIDENCE)
-    nearer = (rows >= highest) & (not_blank > 0) & ~standing[half]
+    nearer = (rows >= highest) & (not_blank > 0) & ~frame.heights.standing[half]
     fill = inside & (nearer | _next_to_floor(small)) & ~(beside | odd)[half]
     mask = with_floor(mask, enlarged(fill, mask))
     # Light on the floor is no border, where both ends of a stretch are known.
@@ -140,7 +135,7 @@ def beside_something(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.boo
     """Tell of what only the left camera sees, at the left border of a mask (R, W), where it does
     not lie beside floor that both cameras see: what stands there is taken to go on.
     """
-    floor_px = view.plane_px
+    floor_px = np.float32(view.line.slope) * (view.derolled - np.float32(view.line.horizon))
     first = (mask != NO_EVIDENCE).argmax(axis=1)[:, None]
     begins_with_floor = np.take_along_axis(mask, first, axis=1) == FLOOR
     begins_with_floor &= first * view.step <= floor_px[:, :1] + _UNMATCHED_PX

@@ -22,7 +22,7 @@ from segfloor_ros.core.floor.disparity.matching import NOISE_PX, NOISE_SLOPE, SA
 from segfloor_ros.core.floor.disparity.profile import STEP_PX
 from segfloor_ros.core.floor.mask.look import sigmas_off_floor
 from segfloor_ros.core.floor.mask.painting import enlarged, with_floor, without_floor
-from segfloor_ros.core.floor.mask.pixel_evidence import LEAST_FLOOR_PX, Costs
+from segfloor_ros.core.floor.mask.pixel_evidence import LEAST_FLOOR_PX
 from segfloor_ros.core.geometry import Array
 
 Picture = NDArray[np.float32]
@@ -67,9 +67,6 @@ _UNEVEN = 0.7, 2.8
 """How uneven floors are, in sigmas of a disparity, at least and at most."""
 _RISE_SIGMA_PX = 0.7, 2.0
 """Error of the difference of two disparities, at least and at most."""
-_UNEQUAL_GREY = 0.8, 0.3
-"""Mean difference of both images of the same thing: so many sigmas of noise, and grey levels."""
-
 _BINS, _END = 2, 10
 """Of the histogram of brightness, per sigma of the floor's; it ends at so many sigmas."""
 _LOOK_NATS = -4.0, 3.0
@@ -82,8 +79,9 @@ class Seen:
 
     floor_px, disparity_px: disparity of the floor, and the matched one, 0 where none is. slope: of
     a floor's disparity, per row of the image. texture: as many times of what is surely no noise.
-    lower: bool, what lies deeper than a robot may drop. grey: brightness, smoothed. costs: None of
-    a depth camera. noise_grey: of the images. is_floor: bool, what is floor so far.
+    lower: bool, what lies deeper than a robot may drop. grey: brightness, smoothed. better: log
+    ratio of how much the images differ on the floor to how much they do as matched. noise_grey: of
+    the images, 0 of depth that is measured. is_floor: bool, what is floor so far.
     """
 
     floor_px: Picture
@@ -92,15 +90,22 @@ class Seen:
     texture: Picture
     lower: NDArray[np.bool_]
     grey: Picture
-    costs: Costs | None
+    better: Picture
     noise_grey: float
     is_floor: NDArray[np.bool_]
 
 
 def known_weight(seen: Seen) -> Picture:
-    """Return how well the disparity of each pixel is known (h, w), in [0, 1]."""
-    weight: Picture = np.clip(2 * seen.texture - 1, 0, 1) * _certainty(seen)
-    return weight * (seen.disparity_px > 0)
+    """Return how well the disparity of each pixel is known (h, w), in [0, 1], 1 where as well as it
+    can be: the bound of Cramer and Rao of what the block around a pixel shows.
+    """
+    weight: Picture = np.clip(2 * seen.texture - 1, 0, 1) * (seen.disparity_px > 0)
+    slope = cv2.Sobel(seen.grey, cv2.CV_32F, 1, 0, ksize=1, scale=1 / (2 * STEP_PX))
+    pixels = _NEAR[0] * _NEAR[1]
+    power = cv2.boxFilter(slope * slope, -1, _NEAR, normalize=False)
+    power -= np.float32(pixels * NOISE_SLOPE * seen.noise_grey**2)
+    variance = np.float32(2 * seen.noise_grey**2) / np.maximum(power, np.float32(1e-3))
+    return weight * (np.float32(NOISE_PX) / np.sqrt(np.float32(NOISE_PX**2) + variance))
 
 
 def features(seen: Seen, weight: Picture) -> Picture:
@@ -116,7 +121,7 @@ def features(seen: Seen, weight: Picture) -> Picture:
     rises *= np.where(rises > 0, np.exp(-(height**2) / 8), is_higher)
     positive = (np.maximum(values, 0) for values in (height, rises, -rises, mostly_on))
     look = _look(seen.grey, seen.is_floor)
-    return np.stack([one, *positive, _matched_better(seen, known), look])
+    return np.stack([one, *positive, seen.better * known, look])
 
 
 def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, float]) -> np.float32:
@@ -133,21 +138,6 @@ def _mean(values: Picture, known: Picture, size: tuple[int, int]) -> Picture:
     share = cv2.blur(known, size)
     mean: Picture = cv2.blur(values, size) / np.maximum(share, np.float32(LEAST_KNOWN))
     return mean
-
-
-def _certainty(seen: Seen) -> Picture | np.float32:
-    """Return how well disparities are known, 1 where as well as they can be: the bound of Cramer
-    and Rao of what the block around a pixel shows.
-    """
-    if seen.costs is None:
-        return np.float32(1)
-    slope = cv2.Sobel(seen.grey, cv2.CV_32F, 1, 0, ksize=1, scale=1 / (2 * STEP_PX))
-    pixels = _NEAR[0] * _NEAR[1]
-    power = cv2.boxFilter(slope * slope, -1, _NEAR, normalize=False)
-    power -= np.float32(pixels * NOISE_SLOPE * seen.noise_grey**2)
-    variance = np.float32(2 * seen.noise_grey**2) / np.maximum(power, np.float32(1e-3))
-    certainty: Picture = np.float32(NOISE_PX) / np.sqrt(np.float32(NOISE_PX**2) + variance)
-    return certainty
 
 
 def _local_height(seen: Seen, weight: Picture, known: Picture) -> tuple[Picture, Picture]:
@@ -190,19 +180,6 @@ def _rise(seen: Seen, weight: Picture, known: Picture) -> Picture:
     nats = of_floor * (2 * rise - of_floor) / (2 * sigma**2)
     ratio[rows:-rows] = np.clip(nats, -_MOST_NATS, _MOST_NATS) * both
     return _mean(ratio, known, _NEAR)
-
-
-def _matched_better(seen: Seen, known: Picture) -> Picture:
-    """Return the log ratio of how much the images differ on the floor to how much they do at the
-    matched disparity; 0 where they say nothing.
-    """
-    if seen.costs is None:
-        return np.zeros_like(known)
-    costs, (sigmas, grey) = seen.costs, _UNEQUAL_GREY
-    noise = np.float32(sigmas * seen.noise_grey + grey)
-    best = np.minimum(costs.matched, costs.floor)
-    ratio: Picture = np.log((costs.floor + noise) / (best + noise)) * known * costs.reached
-    return ratio
 
 
 def _look(grey: Picture, is_floor: NDArray[np.bool_]) -> Picture:

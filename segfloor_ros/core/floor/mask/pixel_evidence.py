@@ -67,22 +67,14 @@ _MARGIN_PX = 4.0
 _NOISE_SHARE = 2.0
 """Two images of the same thing differ by 1.13 sigma of noise on average, and by interpolation."""
 
+_UNEQUAL_GREY = 0.8, 0.3
+"""Mean difference of both images of the same thing: so many sigmas of noise, and grey levels."""
+
 _UPRIGHT_WINDOW = 7, 5
 """Columns and rows of the window above the contact in which the upright surface is measured."""
 _GAP_ROWS = 2
 _MIN_SHARE = 0.25
 _MAX_SPREAD_PX = 1.2
-
-
-@dataclass(frozen=True)
-class Costs:
-    """How much both images differ around each pixel, grey levels: were it floor, and as matched,
-    (R / 2, W'). reached: 1 where the right camera sees the floor, else 0.
-    """
-
-    floor: NDArray[np.float32]
-    matched: NDArray[np.float32]
-    reached: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -93,7 +85,7 @@ class Comparison:
     against: clearly more like the matched disparity than like floor. denied: the same of the
     surroundings taken together. unlike: unlike floor, whatever it is. consistent: may be floor, not
     denied.
-    costs: None of a depth camera.
+    better: float32 as floor_px, `matched_better`.
     """
 
     floor_px: NDArray[np.float32]
@@ -101,21 +93,7 @@ class Comparison:
     denied: NDArray[np.bool_]
     unlike: NDArray[np.bool_]
     consistent: NDArray[np.bool_]
-    costs: Costs | None = None
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """mask: (R, W) uint8. Others, (R, W) bool: above: what is matched above the floor; off,
-    standing: what is matched off it in the mean of its neighbours, farther than their noise
-    explains, and above it, farther than that of a single one; odd: what does not look like floor.
-    """
-
-    mask: NDArray[np.uint8]
-    above: NDArray[np.bool_]
-    off: NDArray[np.bool_]
-    standing: NDArray[np.bool_]
-    odd: NDArray[np.bool_]
+    better: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -134,24 +112,43 @@ class Heights:
     off: NDArray[np.bool_]
     near: NDArray[np.bool_]
 
+    @cached_property
+    def mean_sigmas(self) -> NDArray[np.float32]:
+        """Height of each pixel (R, W) in the mean of its neighbours, in sigmas of one of them; NaN
+        where that is not known.
+        """
+        return _mean_of_neighbours(self.height / self.noise)
+
+    @cached_property
+    def mean_off(self) -> NDArray[np.bool_]:
+        """What in the mean of its neighbours lies off the floor (R, W), by more than their noise
+        explains.
+        """
+        return np.abs(self.mean_sigmas) > SIGMAS * MEAN_NOISE
+
+    @cached_property
+    def standing(self) -> NDArray[np.bool_]:
+        """What in the mean of its neighbours lies above the floor, (R, W)."""
+        return self.mean_sigmas > SIGMAS
+
     @classmethod
     def of(
         cls,
         view: FloorView,
         profile: FloorProfile,
+        pair: Pair,
         disparity: NDArray[np.float32],
         num_disparities: int,
         settings: FloorSegmentationSettings,
-        is_measured: bool = False,
     ) -> Heights:
         """Return the heights of the pixels of a view, of known disparities (R, W), by a table of as
-        many as are searched. is_measured: by a depth camera.
+        many as are searched.
         """
         line, steps = view.line, np.arange(num_disparities * SUBPIXEL + 1) / SUBPIXEL
         steps[0] = np.nan
         scale = line.metres_per_row / steps
-        constant = view.camera.disparity_times_depth
-        noise_px = measured_sigma_px(constant, steps) if is_measured else NOISE_PX
+        constant, is_matched = view.camera.disparity_times_depth, pair.measured is None
+        noise_px = NOISE_PX if is_matched else measured_sigma_px(constant, steps)
         # One pixel of disparity is this much height: the camera's height over the disparity.
         noise = noise_px * line.metres_per_row / line.slope / steps
         row = profile.row_of_disparity(steps)
@@ -180,24 +177,6 @@ class FloorFrame:
     heights: Heights
     compared: Comparison
 
-    @classmethod
-    def of(
-        cls,
-        view: FloorView,
-        profile: FloorProfile,
-        pair: Pair,
-        disparity_px: NDArray[np.float32],
-        num_disparities: int,
-        settings: FloorSegmentationSettings,
-    ) -> FloorFrame:
-        """Return the frame of a pair, compared with its floor. num_disparities: searched."""
-        searched = num_disparities, settings, pair.measured is not None
-        heights = Heights.of(view, profile, disparity_px, *searched)
-        on_floor = lies_on_floor(view, disparity_px, heights)
-        compare = compare_images if pair.measured is None else compare_measured
-        compared = compare(view, profile, pair, disparity_px, on_floor)
-        return cls(view, profile, pair, disparity_px, heights, compared)
-
     @cached_property
     def upright_px(self) -> NDArray[np.float32]:
         """`upright_above`, by what has texture."""
@@ -205,8 +184,8 @@ class FloorFrame:
 
 
 def judge(frame: FloorFrame, step_m: float) -> NDArray[np.uint8]:
-    """Return what the pixels (R, W) of a frame say by themselves, the mask of `Evidence`. step_m:
-    what a robot climbs.
+    """Return a mask (R, W) of what the pixels of a frame say by themselves. step_m: what a robot
+    climbs.
 
     A disparity makes floor only where the images agree, and denies it only where they do.
     """
@@ -254,13 +233,6 @@ def last_evidence(
 def below_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Tell of each pixel of a mask (R, W) whether the next evidence up its column is floor."""
     return last_evidence(mask)[1]
-
-
-def mean_height(heights: Heights) -> NDArray[np.float32]:
-    """Return the height above the floor of each pixel (R, W) in the mean of its neighbours, in
-    sigmas of one of them; NaN where that is not known.
-    """
-    return _mean_of_neighbours(heights.height / heights.noise)
 
 
 def lies_on_floor(
@@ -327,35 +299,37 @@ def upright_above(
     return np.where(good, average, np.float32(np.nan))
 
 
-def compare_images(
+def compare(
     view: FloorView,
     profile: FloorProfile,
     pair: Pair,
     disparity: NDArray[np.float32],
-    on_floor: NDArray[np.bool_],
+    heights: Heights,
 ) -> Comparison:
-    """Compare the view's rows of a rectified pair under floor and under the disparities (R, W).
+    """Compare the view's rows of a rectified pair under floor and under the disparities (R, W); of
+    a depth camera, which has no right image, the disparities with the floor's.
 
-    on_floor: (R, W), where the disparities are those of a floor, though not of the profile: it
-    bends only along the way. Where the right image does not reach, nothing speaks against the floor
-    nor for it.
+    Disparities may be those of a floor, though not of the profile: it bends only along the way.
+    Where the right image does not reach, nothing speaks against the floor nor for it.
     """
-    left, right, noise_grey = pair.left_rows, pair.right_rows, pair.noise_grey
-    sampled = left[::STEP_PX, ::STEP_PX]
-    steps = (np.arange(0, size, STEP_PX, dtype=np.float32) for size in left.shape)
-    rows, columns = np.meshgrid(*steps, indexing='ij')
+    on_floor = lies_on_floor(view, disparity, heights)
     floor_px = profile.at_pixels(view.derolled[view.half])
+    if pair.measured is not None:
+        off_px = np.abs(disparity - profile.at_pixels(view.derolled))
+        against = (disparity > 0) & (off_px > np.float32(SAME_PX)) & ~on_floor
+        nowhere, nothing = np.zeros_like(against), np.zeros_like(floor_px)
+        return Comparison(floor_px, against, against, nowhere, ~against, nothing)
+    left, right, noise_grey = pair.left_rows, pair.right[pair.part[0]], pair.noise_grey
+    sampled = left[::STEP_PX, ::STEP_PX]
+    rows, columns = STEP_PX * np.indices(sampled.shape, np.float32)
     matched_px = disparity[view.half]
-
-    def right_at(disparity_px: NDArray[np.float32]) -> NDArray[np.uint8]:
-        at = columns - disparity_px
-        seen = cv2.remap(right, at, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return seen.astype(np.uint8, copy=False)
-
     reached = columns >= floor_px + _MARGIN_PX
     lying = on_floor[view.half] & (matched_px > 0)
-    as_floor = right_at(np.where(lying, matched_px, floor_px))
-    matched = _local_difference(sampled, right_at(matched_px))
+    as_floor, as_matched = (
+        cv2.remap(right, columns - px, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for px in (np.where(lying, matched_px, floor_px), matched_px)
+    )
+    matched = _local_difference(sampled, as_matched)
     floor = _local_difference(sampled, as_floor)
     lying &= reached & (np.abs(matched_px - floor_px) < np.float32(SAME_PX))
     foreign = _foreign(sampled, as_floor, lying, noise_grey)
@@ -372,23 +346,23 @@ def compare_images(
     against, denied, unlike, contrary = (
         enlarged(mask & reached, disparity) for mask in (against, denied, unlike, contrary)
     )
-    costs = Costs(floor, matched, reached.astype(np.float32))
-    return Comparison(floor_px, against, denied, unlike, ~contrary, costs)
+    better = matched_better(floor, matched, reached, noise_grey)
+    return Comparison(floor_px, against, denied, unlike, ~contrary, better)
 
 
-def compare_measured(
-    view: FloorView,
-    profile: FloorProfile,
-    _: Pair,
-    disparity: NDArray[np.float32],
-    on_floor: NDArray[np.bool_],
-) -> Comparison:
-    """Compare the floor with disparities (R, W) that a depth camera measured, 0 for none: there is
-    no right image to look at. on_floor: as of `compare_images`.
+def matched_better(
+    floor: NDArray[np.float32],
+    matched: NDArray[np.float32],
+    reached: NDArray[np.bool_],
+    noise_grey: float,
+) -> NDArray[np.float32]:
+    """Return the log ratio of how much the images differ on the floor, in grey levels (R, W), to
+    how much they do as matched; 0 where the right image does not reach.
     """
-    floor_px = profile.at_pixels(view.derolled)
-    against = (disparity > 0) & (np.abs(disparity - floor_px) > np.float32(SAME_PX)) & ~on_floor
-    return Comparison(floor_px[view.half], against, against, np.zeros_like(against), ~against)
+    sigmas, grey = _UNEQUAL_GREY
+    noise = np.float32(sigmas * noise_grey + grey)
+    ratio = np.log((floor + noise) / (np.minimum(matched, floor) + noise))
+    return np.asarray(ratio * reached)
 
 
 def _foreign(

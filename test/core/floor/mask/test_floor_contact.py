@@ -36,7 +36,7 @@ def filled(
     foot_px = float(profile.at_rows(np.array([FIRST_ROW + CONTACT_ROW]))[0])
     disparity = np.where(wall, wall_px_of_floor * foot_px, 0).astype(np.float32)
     floor_px = profile.at_pixels(view.derolled[::2, :: 2 // view.step])
-    compared = Comparison(floor_px, wall, wall, wall, ~wall)
+    compared = Comparison(floor_px, wall, wall, wall, ~wall, np.zeros_like(floor_px))
     plain = ~wall[::2, :: 2 // view.step]
     may_begin = (rows >= shape[0] - alike_rows)[::2, :: 2 // view.step]
     upright_px = upright_above(view, disparity, compared, wall & has_texture)
