@@ -13,10 +13,11 @@ import numpy as np
 
 from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.floor.mask.filling import fill_to_contact
-from segfloor_ros.core.floor.mask.pixel_evidence import upright_above
+from segfloor_ros.core.floor.mask.pixel_evidence import FloorFrame
 
 ROOM = 'segfloor_ros.'
 NOTHING = 'nothing'
+_UPRIGHT_PX = FloorFrame.__dict__['upright_px']
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,9 @@ def _nowhere(like: Any, *_: object) -> Any:
     return np.zeros(like.shape, np.bool_)
 
 
-def _above_anything(view: Any, disparity: Any, compared: Any, textured: Any) -> Any:
-    return upright_above(view, disparity, compared, np.ones_like(textured))
+def _above_anything(frame: FloorFrame) -> Any:
+    textured = dataclasses.replace(frame.pair, texture=np.full_like(frame.pair.texture, np.inf))
+    return _UPRIGHT_PX.func(dataclasses.replace(frame, pair=textured))
 
 
 def _begun_anywhere(view: Any, mask: Any, alike: Any, may_begin: Any, *others: Any) -> Any:
@@ -167,7 +169,7 @@ FLOOR: dict[str, Mechanism] = {
         {'core.floor.mask.filling.fill_to_contact': _begun_anywhere}
     ),
     'contacts with what has texture alone': Mechanism(
-        {'core.floor.mask.pixel_evidence.upright_above': _above_anything}
+        {'core.floor.mask.pixel_evidence.FloorFrame.upright_px': property(_above_anything)}
     ),
     'feet of blank faces': Mechanism(
         {'core.floor.segmentation.blank_feet': lambda *_: (np.zeros(0, np.float32), _no_rows())}

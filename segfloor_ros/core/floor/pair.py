@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import is_disparity
-from segfloor_ros.core.camera.pixels import noise_grey, seen_from_right
-from segfloor_ros.core.contracts import NO_EVIDENCE
+from segfloor_ros.core.camera.pixels import noise_grey, seen_from_right, union
+from segfloor_ros.core.contracts import MOVING, NO_EVIDENCE
 from segfloor_ros.core.floor.disparity.matching import equal_exposure
 from segfloor_ros.core.floor.disparity.profile import STEP_PX
 
@@ -28,16 +28,15 @@ TEXTURE_WINDOW_PX = 11
 """Over so wide a square texture is measured."""
 EDGE_SLOPE = 24
 """Sobel response of the weakest edge that counts: 3 grey levels per row."""
-_PLAIN_TO_SEE = 100.0
-"""Texture of what a depth camera measured, over what is no noise."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """A pair as floor is looked for in it: `left`, `right`, `moving` and `said` as in
+    """A pair as floor is looked for in it: `left`, `right` and `said` as in
     `FloorSegmentation.process`, where a depth camera has what a right one would see, and what it
-    measured. part: of the image that can show floor, in the columns that are used, (R, W).
-    noise_grey: of the left image. enough: texture that is no noise; texture: (R, W).
+    measured. moving: mask (H, W), 255 where what is seen does not count. part: of the image that
+    can show floor, in the columns that are used, (R, W). noise_grey: of the left image. enough:
+    texture that is no noise; texture: (R, W).
     """
 
     left: NDArray[np.uint8]
@@ -62,14 +61,15 @@ class Pair:
         """Return a pair, or an image and its disparity, with the texture of its part."""
         measured = np.nan_to_num(right, nan=0.0) if is_disparity(right) else None
         right = equal_exposure(left, right) if measured is None else seen_from_right(left, right)
+        if said is not None:
+            moving = union(moving, np.where(said == MOVING, np.uint8(255), np.uint8(0)))
         left_rows = left[part[0]]
         noise = noise_grey(left_rows)
         enough = enough_texture(noise)
         texture = texture_grey(left_rows, TEXTURE_WINDOW_PX)[:, part[1]]
         if measured is not None:
             # Depth is measured on plain surfaces, too; a hole in it tells nothing.
-            plain = np.float32(_PLAIN_TO_SEE * enough)
-            texture = np.where(measured[part] > 0, plain, np.float32(0))
+            texture = np.where(measured[part] > 0, np.float32(100 * enough), np.float32(0))
         return cls(left, right, measured, moving, said, part, noise, enough, texture)
 
     @property

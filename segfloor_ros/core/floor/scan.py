@@ -24,7 +24,7 @@ from segfloor_ros.core.floor.disparity.matching import (
     SPECKLE_PX,
     DisparityMatcher,
 )
-from segfloor_ros.core.floor.disparity.profile import histogram
+from segfloor_ros.core.floor.disparity.profile import STEP_PX, histogram
 from segfloor_ros.core.floor.pair import Pair, texture_grey
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.geometry import Array, transform_points
@@ -38,8 +38,6 @@ _CONTACT_ROWS = 2.5
 """So many rows may be missing where the floor meets what stands on it."""
 _FADING_ROWS = 1.5
 """So many rows are taken off where nothing shows why the floor ends."""
-_GAP_ROWS = _CONTACT_ROWS + _FADING_ROWS
-"""So many image rows of floor may be missing, however many metres they are."""
 _DIP_BEARINGS = 5
 _NARROW_M, _GAP_BEARINGS = 0.2, (5, 9, 17, 33)
 """Gaps between things are closed up to this width, in these numbers of bearings."""
@@ -50,7 +48,6 @@ _SPREAD_BINS = round(SAME_SURFACE_SHARE / _LOG_STEP)
 _NEAREST_M = 0.1
 _MEDIAN_ROUNDS = 3
 
-_SCALE = 2
 _SEEN_BEFORE_M = 0.5
 """What is nearer than this has been seen before."""
 _TEXTURE_WINDOW_PX = 7
@@ -177,7 +174,9 @@ class FloorScanner:
         last = np.maximum.accumulate(np.where(seen, middle, 0.0), axis=1)
         previous = np.concatenate([np.zeros((self._count, 1)), last[:, :-1]], axis=1)
         previous = np.maximum(previous, self._nearest[:, None])
-        tolerated = np.maximum(self._gap_m, _GAP_ROWS * self._row_m(middle))
+        # So many image rows may be missing, however many metres they are.
+        rows_m = (_CONTACT_ROWS + _FADING_ROWS) * self._row_m(middle)
+        tolerated = np.maximum(self._gap_m, rows_m)
         broken = seen & (middle - previous > tolerated)
         unbroken = np.cumsum(broken, axis=1) == 0
         return np.where(seen & unbroken & may_end, middle, 0.0).max(axis=1)
@@ -267,8 +266,8 @@ class OverheadMatcher:
     ) -> None:
         self._camera, self._settings = camera, settings
         nearest_px = min(num_disparities, camera.disparity_times_depth / _SEEN_BEFORE_M)
-        searched = math.ceil(nearest_px / (_SCALE * SUBPIXEL)) * SUBPIXEL
-        self._matcher = DisparityMatcher(searched, COARSE_BLOCK_PX, SPECKLE_PX // _SCALE**2)
+        searched = math.ceil(nearest_px / (STEP_PX * SUBPIXEL)) * SUBPIXEL
+        self._matcher = DisparityMatcher(searched, COARSE_BLOCK_PX, SPECKLE_PX // STEP_PX**2)
 
     def positions(self, pair: Pair, mount: Mount) -> NDArray[np.float32]:
         """Return where in the base's x-y plane something is in the way, (2, N), by the rows of a
@@ -277,17 +276,17 @@ class OverheadMatcher:
         """
         camera, horizon_row = self._camera, pair.first_row
         reach = (self._settings.robot_height_m - mount.height_m) / _SEEN_BEFORE_M * camera.fy
-        first = max(0, horizon_row - int(max(reach, 0.0))) // _SCALE * _SCALE
-        last = first + (horizon_row - first) // _SCALE * _SCALE
+        first = max(0, horizon_row - int(max(reach, 0.0))) // STEP_PX * STEP_PX
+        last = first + (horizon_row - first) // STEP_PX * STEP_PX
         if last - first < RUN_UP_ROWS:
             return np.zeros((2, 0), np.float32)
         rows = slice(first, last)
-        left, right = (shrunk_image(image[rows], _SCALE) for image in (pair.left, pair.right))
+        left, right = (shrunk_image(image[rows], STEP_PX) for image in (pair.left, pair.right))
         size = left.shape[::-1]
         if pair.measured is None:
             disparity = self._matcher.compute(left, right)
             # A slope along the row gets steeper as the image gets smaller.
-            textured = texture_grey(left, _TEXTURE_WINDOW_PX) > _SCALE * pair.enough
+            textured = texture_grey(left, _TEXTURE_WINDOW_PX) > STEP_PX * pair.enough
             known = (disparity > 0) & ~_fringes(disparity)
             certain = _with_boards(disparity, known, known & textured)
         else:
@@ -296,9 +295,9 @@ class OverheadMatcher:
         if pair.moving is not None:
             certain &= cv2.resize(pair.moving[rows], size, interpolation=cv2.INTER_NEAREST) == 0
         v, u = np.nonzero(certain)
-        disparity_px = _SCALE * disparity[v, u].astype(np.float64)
-        centre = 0.5 * (_SCALE - 1)
-        uv_px = np.stack([_SCALE * u + centre, _SCALE * v + first + centre], axis=1)
+        disparity_px = STEP_PX * disparity[v, u].astype(np.float64)
+        centre = 0.5 * (STEP_PX - 1)
+        uv_px = np.stack([STEP_PX * u + centre, STEP_PX * v + first + centre], axis=1)
         return self.in_the_way(uv_px, disparity_px, mount)
 
     def in_the_way(self, uv_px: Array, disparity_px: Array, mount: Mount) -> NDArray[np.float32]:

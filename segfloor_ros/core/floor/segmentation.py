@@ -25,7 +25,6 @@ from segfloor_ros.core.contracts import (
 )
 from segfloor_ros.core.floor.disparity.matching import BLOCK_PX, TwoScaleMatcher, disparity_range
 from segfloor_ros.core.floor.disparity.profile import (
-    BINS_PER_PX,
     STEP_PX,
     FloorView,
     column_step,
@@ -65,8 +64,7 @@ DISPARITY, DISPARITY_ABOVE = 'disparity', 'disparity above the horizon'
 _BORDER_BLOCKS = 2
 """So near to the border of the right image, in blocks that are matched, matches are unsure."""
 _LEAST_SHARE = 0.5
-"""What has less than this share of the texture that a floor needs shows noise, and stands nowhere.
-"""
+"""What has a smaller share of the texture that a floor needs shows noise, and stands nowhere."""
 _BOARD = 2
 """Table tops are thinner than what stands: so many times what is seen of them counts."""
 
@@ -116,7 +114,8 @@ class FloorSegmentation:
         expected = np.vstack([expected, self.fixture.usual(expected[0])])
         with measure('texture'):
             part = self._part(mount, expected)
-            pair = Pair.of(left, right, self._hidden(left, moving, said), said, part)
+            hidden = union(moving, self._border.see(left))
+            pair = Pair.of(left, right, hidden, said, part)
         with measure(DISPARITY):
             disparity, movable = self._disparities(pair)
             below = disparity[part]
@@ -125,7 +124,7 @@ class FloorSegmentation:
         view = FloorView.of(self._camera, _with_angles(mount, angles_height), pair.first_row)
         with measure('profile'):
             clear, searched = pair.texture > 2 * pair.enough, self._matcher.num_disparities
-            counted = filtered_v_disparity(view, below, clear, searched, BINS_PER_PX)
+            counted = filtered_v_disparity(view, below, clear, searched)
             profile = fit_profile(counted, view.line, self._camera)
         with measure('comparison'):
             heights = Heights.of(view, profile, pair, below, searched, self._settings)
@@ -147,11 +146,10 @@ class FloorSegmentation:
             scan = self._scan(frame, judged, mask, hanging_xy, movable_xy)
         if movable is not None:
             disparity = np.maximum(disparity, movable)
-        rows = np.arange(self._camera.height)
         return FloorObservation(
             disparity_px=disparity,
             mask=_whole(view, mask),
-            profile_px=profile.at_rows(rows).astype(np.float64),
+            profile_px=profile.at_rows(np.arange(self._camera.height)).astype(np.float64),
             scan=scan,
             max_disparity_px=max(float(searched), float(disparity.max())),
             v_disparity=counted,
@@ -167,18 +165,6 @@ class FloorSegmentation:
         """Return the rows and columns of the image that are looked at."""
         first_row = min(first_floor_row(self._camera, _with_angles(mount, one)) for one in expected)
         return np.s_[first_row:, :: column_step(self._camera)]
-
-    def _hidden(
-        self,
-        left: NDArray[np.uint8],
-        moving: NDArray[np.uint8] | None,
-        said: NDArray[np.uint8] | None,
-    ) -> NDArray[np.uint8] | None:
-        """Return the mask (H, W) of what does not count: the border, and what moves."""
-        hidden = union(moving, self._border.see(left))
-        if said is None:
-            return hidden
-        return union(hidden, np.where(said == MOVING, np.uint8(255), np.uint8(0)))
 
     def _disparities(self, pair: Pair) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """Return the disparity (H, W) of what counts, and that of what a network says moves."""

@@ -49,8 +49,6 @@ _OVERLAP_PX = 4
 """So near to the end of its range the fine match leaves what is nearer to the coarse one."""
 RUN_UP_ROWS = 16
 """The matcher's paths get a run-up, and the horizon some play."""
-_RUN_OUT_ROWS = 8
-"""The matcher's blocks and paths reach beyond the last fine row."""
 
 
 def disparity_range(camera: StereoCamera, mount: Mount | None, share: float = 1.15) -> int:
@@ -213,7 +211,8 @@ class TwoScaleMatcher:
         disparity[: found.shape[0], : found.shape[1]] = found
         if fine_rows == 0:
             return disparity
-        part = slice(0, fine_rows + _RUN_OUT_ROWS)
+        # The matcher's blocks and paths reach beyond the last fine row.
+        part = slice(0, fine_rows + RUN_UP_ROWS // 2)
         far = self._fine.compute(left[part], right[part])[:fine_rows]
         near = disparity[:fine_rows]
         too_near = near > self._fine.num_disparities - _OVERLAP_PX

@@ -34,13 +34,9 @@ _CONTROLS = SEGMENTS + 3
 BINS_PER_PX = 2
 PITCH_SIGMA_RAD, HEIGHT_SIGMA = 0.006, 0.01
 """How far pitch and height, as a share of it, may swing about the mount, one sigma."""
-_SCALE_PX = 0.6
-"""Scale of the M-estimator."""
-_STIFFNESS = 0.02
-"""How strongly the spline resists bending."""
-_LINE = ((1.5, 1e4), (1.0, 1e4))
-_SPLINE = 2 * ((1.5, 1.0),) + 4 * ((1.0, 1.0),)
-"""Scale of the estimator and stiffness of the spline, relative to the settings, by iteration: a
+_LINE = ((2.7, 200.0), (1.8, 200.0))
+_SPLINE = 2 * ((2.7, 0.02),) + 4 * ((1.8, 0.02),)
+"""Width of Tukey's biweight in pixels, and how strongly the spline resists bending, by iteration: a
 line, near the plane that is known, then a spline, which grows along the floor where that bends."""
 _CORRELATED_PIXELS = 200.0
 """Neighbouring disparities err together: so many of them count as one measurement."""
@@ -52,8 +48,6 @@ _WIDE_PX = 480
 
 STEP_PX = 2
 """Every so many pixels of the image, in rows and columns, are compared, and filled, alike."""
-_BEYOND_ROWS = 1e5
-"""No floor is seen so far below the image."""
 _NEAR_M, _FAR_M = 0.05, 1000.0
 """Depths are between these."""
 
@@ -124,7 +118,7 @@ class FloorProfile:
     def _nodes(self) -> tuple[Array, Array]:
         """Rows and disparities between which the profile is straight; it goes on as the line."""
         rows = self.first_row + np.arange(len(self.disparity_px) + 1.0)
-        rows[-1] += _BEYOND_ROWS
+        rows[-1] += 1e5  # no floor is seen so far below the image
         last_px = self.disparity_px[-1] + self.line.slope * (rows[-1] - rows[-2])
         return rows, np.append(self.disparity_px, last_px)
 
@@ -187,10 +181,10 @@ def fit_profile(v_disparity: VDisparity, line: FloorLine, camera: StereoCamera) 
     bend = np.diff(np.eye(_CONTROLS), n=2, axis=0)
 
     def linearise(controls: Array, stage: tuple[float, float]) -> tuple[Array, Array, float]:
-        factor, stiffness = stage
-        ratio = np.clip((disparity - basis @ controls) / (3 * factor * _SCALE_PX), -1, 1)
+        width_px, stiffness = stage
+        ratio = np.clip((disparity - basis @ controls) / width_px, -1, 1)
         robust = weight * (1 - ratio**2) ** 2
-        known = information + _STIFFNESS * stiffness * bend.T @ bend
+        known = information + stiffness * bend.T @ bend
         weighted = basis.T * robust
         gradient = weighted @ (disparity - basis @ controls) + known @ (prior - controls)
         return weighted @ basis + known, gradient, float(robust.sum())
@@ -333,11 +327,8 @@ def histogram(
 
 
 def obstacle_rows(
-    disparity_px: NDArray[np.floating] | NDArray[np.integer],
-    height_m: float,
-    rows_per_m_px: float,
-    floor_rows_per_px: float,
-) -> NDArray[np.float64]:
+    disparity_px: Array, height_m: float, rows_per_m_px: float, floor_rows_per_px: float
+) -> Array:
     """Return the count at which a u-disparity cell is an obstacle, per disparity.
 
     An upright surface of `height_m` covers `height_m * rows_per_m_px * d` rows (with
@@ -378,7 +369,6 @@ def filtered_v_disparity(
     disparity: NDArray[np.float32],
     textured: NDArray[np.bool_],
     num_disparities: int,
-    bins_per_px: int,
 ) -> VDisparity:
     """Return the v-disparity of what is textured and not upright."""
     camera = view.camera
@@ -390,18 +380,18 @@ def filtered_v_disparity(
     bins = (disparity + np.float32(0.5)).astype(np.intp)
     num = num_disparities + 1
     rows_per_m_px = camera.fy / (camera.fx * camera.baseline_m)
-    limit = obstacle_rows(np.arange(num), _OBSTACLE_M, rows_per_m_px, 1 / view.line.slope)
+    limit = obstacle_rows(np.arange(float(num)), _OBSTACLE_M, rows_per_m_px, 1 / view.line.slope)
     across = np.arange(bins.shape[1])
     upright = histogram(bins, across, (num, len(across))) > limit[:, None]
     upright[0] = False  # no match
     keep = (disparity > 0) & textured[:, ::2] & rising(disparity, view.line.slope)
     keep &= ~upright.take(bins * len(across) + across)
     rows, columns = pixels_where(keep)
-    fine = (disparity[keep] * np.float32(bins_per_px) + np.float32(0.5)).astype(np.intp)
+    fine = (disparity[keep] * np.float32(BINS_PER_PX) + np.float32(0.5)).astype(np.intp)
     shear_px = (view.shear_px[::2] - view.shear_px[0]).take(columns)
     derolled = view.derolled[:, 0].take(rows) + shear_px
     first = math.floor(float(view.derolled.min()))
     last = math.ceil(float(view.derolled.max()))
     rows = (derolled - np.float32(first - 0.5)).astype(np.intp)
-    counts = histogram(rows, fine, (last - first + 1, num * bins_per_px))
-    return VDisparity(counts * (2 * view.step), first, bins_per_px)
+    counts = histogram(rows, fine, (last - first + 1, num * BINS_PER_PX))
+    return VDisparity(counts * (2 * view.step), first, BINS_PER_PX)

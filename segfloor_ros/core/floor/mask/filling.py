@@ -44,9 +44,6 @@ _MIN_SLOPE = 1.5
 """Grey levels per pixel at half resolution; weaker edges bound no region."""
 _STRONG_SLOPE = 10.0
 """Stronger edges than this are the border of something."""
-_TEXTURE_MARGIN = 7
-_HOLE_ROWS = 12
-"""As high as the window in which texture is measured."""
 _UNMATCHED_PX = 12
 """So wide a strip at the border of what is matched may be without matches."""
 
@@ -54,8 +51,6 @@ _BEHIND = 0.6
 """The wall behind may show this share of the disparity: the ground may dip, the pitch err."""
 _EDGE_ROWS = 4
 """So near to the end of the floor is the edge at which it ends."""
-_WEAK_EDGE = 16
-"""Sobel response of the weakest edge that shows that more than one face is seen."""
 _SETTLED_ROWS = 9
 """So far above an edge, what is measured over a window does not know of it."""
 _LEAST_BLANK_ROWS = 3
@@ -90,7 +85,7 @@ def fill_regions(
     count, region = cv2.connectedComponents(core, connectivity=4)
     top = _top_of_supported(region, count, floor)
     highest = -cv2.dilate(-top[region].astype(np.float32), np.ones((3, 3), np.uint8))
-    margin = np.ones((_TEXTURE_MARGIN, _TEXTURE_MARGIN), np.uint8)
+    margin = np.ones(2 * (TEXTURE_WINDOW_PX // STEP_PX + 2,), np.uint8)
     not_blank = cv2.erode(frame.pair.textured[half].astype(np.uint8), margin)
     rows = np.arange(small.shape[0], dtype=np.float32)[:, None]
     inside = (highest < small.shape[0]) & alike & (small == NO_EVIDENCE)
@@ -139,8 +134,9 @@ def beside_something(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.boo
     first = (mask != NO_EVIDENCE).argmax(axis=1)[:, None]
     begins_with_floor = np.take_along_axis(mask, first, axis=1) == FLOOR
     begins_with_floor &= first * view.step <= floor_px[:, :1] + _UNMATCHED_PX
-    # Rows in between begin with a hole.
-    near = cv2.dilate(begins_with_floor.view(np.uint8), np.ones((_HOLE_ROWS + 1, 1), np.uint8))
+    # Rows in between begin with a hole, as high as the window in which texture is measured.
+    hole = np.ones((TEXTURE_WINDOW_PX + 2, 1), np.uint8)
+    near = cv2.dilate(begins_with_floor.view(np.uint8), hole)
     return (view.columns < floor_px) & (near == 0)
 
 
@@ -238,7 +234,8 @@ def blank_feet(
     top = (mask == FLOOR).argmax(axis=0)
     near = np.clip(top + np.arange(-_EDGE_ROWS, _EDGE_ROWS + 1)[:, None], 1, height - 2)
     edge = np.take_along_axis(near, slope[near, columns].argmax(axis=0)[None], axis=0)[0]
-    seen = (frame.pair.textured | (slope >= _WEAK_EDGE)).cumsum(axis=0, dtype=np.int16)
+    # Weaker edges, too, show that more than one face is seen.
+    seen = (frame.pair.textured | (slope >= EDGE_SLOPE * 2 // 3)).cumsum(axis=0, dtype=np.int16)
     horizon = np.clip(np.rint(view.line.horizon - view.shear_px - view.first_row), 0, height - 1)
     end = edge - _SETTLED_ROWS
     begin = horizon.astype(np.intp)

@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 from segfloor_ros.core.floor.disparity.matching import NOISE_PX, NOISE_SLOPE, SAME_PX, SIGMAS
 from segfloor_ros.core.floor.disparity.profile import STEP_PX
 from segfloor_ros.core.floor.mask.look import sigmas_off_floor
-from segfloor_ros.core.floor.mask.painting import enlarged, with_floor, without_floor
+from segfloor_ros.core.floor.mask.painting import (
+    LEAST_KNOWN,
+    enlarged,
+    mean_of_known,
+    with_floor,
+    without_floor,
+)
 from segfloor_ros.core.floor.mask.pixel_evidence import LEAST_FLOOR_PX
 from segfloor_ros.core.geometry import Array
 
@@ -45,8 +51,6 @@ off. matched: log ratio of the difference of both images on the floor to that at
 disparity. look: log ratio of how likely its brightness is of the floor to how often it is seen.
 """
 
-_IN_ORDER = tuple(WEIGHTS.values())
-
 _SURE, _UNLIKELY = (math.log(p / (1 - p)) for p in (0.95, 1 / 3))
 """Log odds: what is more likely floor than the first is floor, what is less likely than the second
 is none."""
@@ -55,10 +59,6 @@ _LOCAL, _ROUNDS = (31, 15), 3
 """Columns and rows of the window in which the floor around a pixel is measured, and how often."""
 _NOTHING = 0.02
 """So small a share of a window tells nothing."""
-LEAST_KNOWN = 0.2
-"""What is known less well than this share says nothing."""
-_LEAST_PIXELS = 100
-"""Fewer do not tell how they spread."""
 _NEAR, _WIDE = (5, 5), (9, 9)
 """Columns and rows of the windows over which pixels are averaged, and are counted."""
 _MOST_SIGMAS, _MOST_NATS = 12.0, 6.0
@@ -126,18 +126,11 @@ def features(seen: Seen, weight: Picture) -> Picture:
 
 def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, float]) -> np.float32:
     """Return the standard deviation of some values by their median, within bounds; the least where
-    they are few.
+    there are none.
     """
     some = values[where]
-    spread = 1.4826 * float(np.median(np.abs(some))) if len(some) > _LEAST_PIXELS else 0.0
+    spread = 1.4826 * float(np.median(np.abs(some))) if len(some) else 0.0
     return np.float32(np.clip(spread, *bounds))
-
-
-def _mean(values: Picture, known: Picture, size: tuple[int, int]) -> Picture:
-    """Return the sum of values around each pixel over how much is known there."""
-    share = cv2.blur(known, size)
-    mean: Picture = cv2.blur(values, size) / np.maximum(share, np.float32(LEAST_KNOWN))
-    return mean
 
 
 def _local_height(seen: Seen, weight: Picture, known: Picture) -> tuple[Picture, Picture]:
@@ -154,12 +147,13 @@ def _local_height(seen: Seen, weight: Picture, known: Picture) -> tuple[Picture,
         on = weight * ((gap < SIGMAS * 1.5) & (gap > lowest))
         floor = cv2.blur(on * above, _LOCAL) / (cv2.blur(on, _LOCAL) + np.float32(_NOTHING))
         lowest = -SIGMAS * 1.5
-    smooth = _mean(above, known, _NEAR) - floor
+    smooth = mean_of_known(above, known, _NEAR)[0] - floor
     even = (weight > LEAST_KNOWN) & (np.abs(smooth) < 3 * SIGMAS)
     height = (above - floor) / _spread(smooth, even, _UNEVEN)
     bounded = np.clip(height, -_MOST_SIGMAS, _MOST_SIGMAS) * weight
     on_off = np.where(np.abs(height) < SIGMAS, weight, -weight)
-    return _mean(bounded, known, _NEAR) * known, _mean(on_off, known, _WIDE)
+    near, wide = mean_of_known(bounded, known, _NEAR)[0], mean_of_known(on_off, known, _WIDE)[0]
+    return near * known, wide
 
 
 def _rise(seen: Seen, weight: Picture, known: Picture) -> Picture:
@@ -179,7 +173,7 @@ def _rise(seen: Seen, weight: Picture, known: Picture) -> Picture:
     ratio = np.zeros_like(known)
     nats = of_floor * (2 * rise - of_floor) / (2 * sigma**2)
     ratio[rows:-rows] = np.clip(nats, -_MOST_NATS, _MOST_NATS) * both
-    return _mean(ratio, known, _NEAR)
+    return mean_of_known(ratio, known, _NEAR)[0]
 
 
 def _look(grey: Picture, is_floor: NDArray[np.bool_]) -> Picture:
@@ -197,10 +191,12 @@ def _look(grey: Picture, is_floor: NDArray[np.bool_]) -> Picture:
 
 
 class Likelihood:
-    """Finds how likely the pixels of a frame are floor. weights: of the features, (F,)."""
+    """Finds how likely the pixels of a frame are floor. weights: of the features, (F,); `WEIGHTS`
+    where none are given."""
 
-    def __init__(self, weights: Sequence[float] | Array = _IN_ORDER) -> None:
-        self.weights = np.array(weights, np.float32)
+    def __init__(self, weights: Sequence[float] | Array | None = None) -> None:
+        chosen = list(WEIGHTS.values()) if weights is None else weights
+        self.weights = np.array(chosen, np.float32)
 
     def weighed(self, mask: NDArray[np.uint8], seen: Seen) -> NDArray[np.uint8]:
         """Return a mask (R, W) without floor that is not likely, and with what surely is floor,

@@ -37,7 +37,12 @@ from segfloor_ros.core.floor.disparity.profile import (
     pixels_where,
     surface_above,
 )
-from segfloor_ros.core.floor.mask.painting import enlarged, without_floor
+from segfloor_ros.core.floor.mask.painting import (
+    LEAST_KNOWN,
+    enlarged,
+    mean_of_known,
+    without_floor,
+)
 from segfloor_ros.core.floor.pair import Pair
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
@@ -50,7 +55,6 @@ _CONTACT_HEIGHT_M = 0.12
 _NEIGHBOURS_PX = 9
 """Heights are averaged over so wide a square; ones that are matched err together."""
 _MOST_SIGMAS = np.float32(10)
-_LEAST_KNOWN = 0.2
 
 _AGAINST_GREY = 1.0
 """By how much the images must contradict the floor to deny it, beyond their noise."""
@@ -179,8 +183,17 @@ class FloorFrame:
 
     @cached_property
     def upright_px(self) -> NDArray[np.float32]:
-        """`upright_above`, by what has texture."""
-        return upright_above(self.view, self.disparity_px, self.compared, self.pair.textured)
+        """Disparity of the upright surface right above each pixel, NaN where none is, at half the
+        resolution in both directions of the image. Where nothing has texture, disparities are of
+        noise.
+        """
+        half = self.view.half
+        disparity, textured = self.disparity_px[half], self.pair.textured[half]
+        counted = ~self.compared.consistent[half] & textured & (disparity > 0)
+        surface = disparity, counted.astype(np.float32), _UPRIGHT_WINDOW, _GAP_ROWS
+        average, variance, share = surface_above(*surface)
+        good = (share >= _MIN_SHARE) & (variance < _MAX_SPREAD_PX**2)
+        return np.where(good, average, np.float32(np.nan))
 
 
 def judge(frame: FloorFrame, step_m: float) -> NDArray[np.uint8]:
@@ -256,10 +269,9 @@ def _mean_of_neighbours(sigmas: NDArray[np.float32]) -> NDArray[np.float32]:
     """
     window = (_NEIGHBOURS_PX, _NEIGHBOURS_PX)
     known = np.isfinite(sigmas)
-    share = cv2.blur(known.astype(np.float32), window)
     bounded = np.clip(np.where(known, sigmas, np.float32(0)), -_MOST_SIGMAS, _MOST_SIGMAS)
-    mean = cv2.blur(bounded, window) / np.maximum(share, np.float32(_LEAST_KNOWN))
-    return np.where(share > _LEAST_KNOWN, mean, np.float32(np.nan))
+    mean, share = mean_of_known(bounded, known.astype(np.float32), window)
+    return np.where(share > LEAST_KNOWN, mean, np.float32(np.nan))
 
 
 def _below_contact(
@@ -278,25 +290,6 @@ def _below_contact(
     covered[:height] = low
     covered -= histogram(end, columns, covered.shape).astype(np.int16)
     return np.cumsum(covered, axis=0, dtype=np.int16)[:height] >= 2
-
-
-def upright_above(
-    view: FloorView,
-    disparity: NDArray[np.float32],
-    compared: Comparison,
-    textured: NDArray[np.bool_],
-) -> NDArray[np.float32]:
-    """Return the disparity of the upright surface right above each pixel, NaN where none is, at
-    half the resolution in both directions of the image. disparity, textured: (R, W); where nothing
-    has texture, disparities are of noise.
-    """
-    half_px = disparity[view.half]
-    contrary = (~compared.consistent & textured)[view.half] & (half_px > 0)
-    average, variance, share = surface_above(
-        half_px, contrary.astype(np.float32), _UPRIGHT_WINDOW, _GAP_ROWS
-    )
-    good = (share >= _MIN_SHARE) & (variance < _MAX_SPREAD_PX**2)
-    return np.where(good, average, np.float32(np.nan))
 
 
 def compare(

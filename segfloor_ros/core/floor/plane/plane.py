@@ -130,8 +130,6 @@ SWAY = (math.radians(2.0), math.radians(2.5), 0.04)
 """How much pitch, roll and height, as a share of it, of the camera above the floor vary on the way,
 as standard deviations: robots sway, and where they are is known so well.
 """
-_INTERVAL_PERCENT = (2.5, 16, 50, 84, 97.5)
-"""One and two sigmas to either side of the median: a few wrong planes do not count."""
 _LEAST_SUPPORT, _MOST_BELOW = 0.08, 0.15
 """A floor is so much of what is seen where it is visible. What is seen below it, of mirrors and
 wrong matches, is so small a share of that: of true floors 0.11 at most, of boards 0.2 to 0.4.
@@ -186,7 +184,8 @@ class Fixture:
             return
         self._planes.append(fit.angles_height)
         heights_m = np.array(self._planes)[:, 2]
-        low, minus, middle, plus, high = np.percentile(heights_m, _INTERVAL_PERCENT)
+        # One and two sigmas to either side of the median: a few wrong planes do not count.
+        low, minus, middle, plus, high = np.percentile(heights_m, (2.5, 16, 50, 84, 97.5))
         if len(heights_m) >= LOOKS and plus - minus > 2 * SWAY[2] * middle:
             self.problem = (
                 'the camera is not fixed to its base: its height above the floor varies by '
@@ -318,11 +317,9 @@ def _jacobian(angles_height: Array) -> Array:
     """Return dm / d(pitch, roll, height) (3, 3)."""
     pitch, roll, height = (float(value) for value in angles_height)
     (sp, cp), (sr, cr) = ((math.sin(angle), math.cos(angle)) for angle in (pitch, roll))
-    by_angles = np.array(
-        [[sp * sr, -cp * cr, cp * sr / height], [sp * cr, cp * sr, cp * cr / height]]
-    )
-    by_angles = np.vstack([by_angles, [-cp, 0.0, sp / height]])
-    return by_angles / height
+    right = (sp * sr, -cp * cr, cp * sr / height)
+    down = (sp * cr, cp * sr, cp * cr / height)
+    return np.array([right, down, (-cp, 0.0, sp / height)]) / height
 
 
 def _normal_equations(samples: Samples, state: Array, scale: float) -> tuple[Array, Array, Array]:

@@ -51,5 +51,5 @@ def test_what_covers_as_many_rows_as_an_obstacle_is_not_counted(period, share):
     rows = np.arange(240)[:, None] % period
     disparity = np.broadcast_to(20 + view.line.slope * rows, view.derolled.shape)
     textured = np.ones(disparity.shape, bool)
-    seen = filtered_v_disparity(view, disparity.astype(np.float32), textured, 128, 1)
+    seen = filtered_v_disparity(view, disparity.astype(np.float32), textured, 128)
     assert seen.counts.sum() / disparity.size / view.step == pytest.approx(share, abs=0.1)
