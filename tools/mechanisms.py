@@ -13,11 +13,11 @@ import numpy as np
 
 from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.floor.mask.filling import fill_to_contact
-from segfloor_ros.core.floor.mask.pixel_evidence import FloorFrame
+from segfloor_ros.core.floor.mask.pixel_evidence import FrameEvidence
 
 ROOM = 'segfloor_ros.'
 NOTHING = 'nothing'
-_UPRIGHT_PX = FloorFrame.__dict__['upright_px']
+_UPRIGHT_PX = FrameEvidence.__dict__['upright_px']
 
 
 @dataclass(frozen=True)
@@ -70,13 +70,13 @@ def _nowhere(like: Any, *_: object) -> Any:
     return np.zeros(like.shape, np.bool_)
 
 
-def _above_anything(frame: FloorFrame) -> Any:
+def _above_anything(frame: FrameEvidence) -> Any:
     textured = dataclasses.replace(frame.pair, texture=np.full_like(frame.pair.texture, np.inf))
     return _UPRIGHT_PX.func(dataclasses.replace(frame, pair=textured))
 
 
-def _begun_anywhere(view: Any, mask: Any, alike: Any, may_begin: Any, *others: Any) -> Any:
-    return fill_to_contact(view, mask, alike, np.ones_like(may_begin), *others)
+def _begun_anywhere(frame: Any, mask: Any, alike: Any, may_begin: Any) -> Any:
+    return fill_to_contact(frame, mask, alike, np.ones_like(may_begin))
 
 
 SLAM: dict[str, Mechanism] = {
@@ -163,13 +163,13 @@ FLOOR: dict[str, Mechanism] = {
     'swings over bumps': Mechanism({'core.floor.plane.plane.PROPOSALS': 0}),
     'guard at the right border': Mechanism({'core.floor.segmentation._BORDER_BLOCKS': 0}),
     'floor up to contacts': Mechanism(
-        {'core.floor.mask.filling.fill_to_contact': lambda view, mask, alike, *_: _nowhere(alike)}
+        {'core.floor.mask.filling.fill_to_contact': lambda frame, mask, alike, _: _nowhere(alike)}
     ),
     'what the image cuts off looks like floor': Mechanism(
         {'core.floor.mask.filling.fill_to_contact': _begun_anywhere}
     ),
     'contacts with what has texture alone': Mechanism(
-        {'core.floor.mask.pixel_evidence.FloorFrame.upright_px': property(_above_anything)}
+        {'core.floor.mask.pixel_evidence.FrameEvidence.upright_px': property(_above_anything)}
     ),
     'feet of blank faces': Mechanism(
         {'core.floor.segmentation.blank_feet': lambda *_: (np.zeros(0, np.float32), _no_rows())}

@@ -47,7 +47,7 @@ from segfloor_ros.core.floor.mask.likelihood import Likelihood, Seen
 from segfloor_ros.core.floor.mask.look import unlike_floor
 from segfloor_ros.core.floor.mask.painting import with_floor, without_floor
 from segfloor_ros.core.floor.mask.pixel_evidence import (
-    FloorFrame,
+    FrameEvidence,
     Heights,
     below_floor,
     compare,
@@ -129,7 +129,7 @@ class FloorSegmentation:
         with measure('comparison'):
             heights = Heights.of(view, profile, pair, below, searched, self._settings)
             compared = compare(view, profile, pair, below, heights)
-            frame = FloorFrame(view, profile, pair, below, heights, compared)
+            frame = FrameEvidence(view, profile, pair, below, heights, compared)
         with measure('evidence'):
             judged, odd = _judged(frame, self._settings.step_height_m)
         with measure('filling'):
@@ -217,7 +217,7 @@ class FloorSegmentation:
         return disparity
 
     def _fill(
-        self, frame: FloorFrame, judged: NDArray[np.uint8], looks_odd: NDArray[np.bool_]
+        self, frame: FrameEvidence, judged: NDArray[np.uint8], looks_odd: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
         """Return the mask with floor where this pair of images alone cannot tell: where it looks
         like floor. The more floor is known the better is known how it looks, so this is done twice,
@@ -241,7 +241,7 @@ class FloorSegmentation:
 
     def _scan(
         self,
-        frame: FloorFrame,
+        frame: FrameEvidence,
         judged: NDArray[np.uint8],
         mask: NDArray[np.uint8],
         hanging_xy: NDArray[np.float32],
@@ -276,7 +276,7 @@ class FloorSegmentation:
         return self._overhead.in_the_way(uv_px.astype(float), at.astype(float), view.mount)
 
 
-def _judged(frame: FloorFrame, step_m: float) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+def _judged(frame: FrameEvidence, step_m: float) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Return a mask (R, W) of what the pixels of a frame say by themselves, cut back to edges, and
     left open where they do not look like floor and are not measured to lie on it; and of what a
     network says stands there; and what does not look like floor (R, W). step_m: what a robot
@@ -294,7 +294,7 @@ def _judged(frame: FloorFrame, step_m: float) -> tuple[NDArray[np.uint8], NDArra
     return mask, odd
 
 
-def _seen(frame: FloorFrame, mask: NDArray[np.uint8]) -> Seen:
+def _seen(frame: FrameEvidence, mask: NDArray[np.uint8]) -> Seen:
     """Return what the likelihood weighs. mask: (R, W), with what is floor so far."""
     pair, heights, compared, half = frame.pair, frame.heights, frame.compared, frame.view.half
     grey = cv2.blur(pair.left_rows, (BLOCK_PX, BLOCK_PX))[::STEP_PX, ::STEP_PX]
@@ -311,7 +311,7 @@ def _seen(frame: FloorFrame, mask: NDArray[np.uint8]) -> Seen:
     )
 
 
-def _feet(frame: FloorFrame, mask: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _feet(frame: FrameEvidence, mask: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return where blank faces stand, and what a network says stands, whatever its depth: its
     lowest pixel in each column, unless the image ends; (2, N) in the base's x-y plane.
     """

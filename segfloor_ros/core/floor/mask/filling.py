@@ -25,12 +25,7 @@ from segfloor_ros.core.floor.disparity.profile import (
     pixels_where,
 )
 from segfloor_ros.core.floor.mask.painting import enlarged, with_floor, without_floor
-from segfloor_ros.core.floor.mask.pixel_evidence import (
-    Comparison,
-    FloorFrame,
-    below_floor,
-    last_evidence,
-)
+from segfloor_ros.core.floor.mask.pixel_evidence import FrameEvidence, below_floor, last_evidence
 from segfloor_ros.core.floor.pair import EDGE_SLOPE, TEXTURE_WINDOW_PX
 
 _MIN_REGION_PX = 15
@@ -61,7 +56,7 @@ measured."""
 
 
 def fill_regions(
-    frame: FloorFrame, mask: NDArray[np.uint8], beside: NDArray[np.bool_], odd: NDArray[np.bool_]
+    frame: FrameEvidence, mask: NDArray[np.uint8], beside: NDArray[np.bool_], odd: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
     """Return the mask with NO_EVIDENCE turned to floor in regions that look alike and continue
     floor.
@@ -90,12 +85,13 @@ def fill_regions(
     rows = np.arange(small.shape[0], dtype=np.float32)[:, None]
     inside = (highest < small.shape[0]) & alike & (small == NO_EVIDENCE)
     nearer = (rows >= highest) & (not_blank > 0) & ~frame.heights.standing[half]
-    fill = inside & (nearer | _next_to_floor(small)) & ~(beside | odd)[half]
+    left, right = last_evidence(small, 1)[1], last_evidence(small[:, ::-1], 1)[1][:, ::-1]
+    next_to_floor = left & right | below_floor(small)
+    fill = inside & (nearer | next_to_floor) & ~(beside | odd)[half]
     mask = with_floor(mask, enlarged(fill, mask))
     # Light on the floor is no border, where both ends of a stretch are known.
     no_border = agreed & (slope < _STRONG_SLOPE)
-    shown = frame.upright_px, frame.compared
-    to_contact = fill_to_contact(frame.view, mask, no_border, ~odd[half], *shown)
+    to_contact = fill_to_contact(frame, mask, no_border, ~odd[half])
     return with_floor(mask, enlarged(to_contact, mask))
 
 
@@ -116,14 +112,6 @@ def _top_of_supported(
     is_large = np.bincount(owner, minlength=count) >= _MIN_REGION_PX
     is_large[0] = False
     return np.where(is_large & is_wide, first, len(region))
-
-
-def _next_to_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Tell of NO_EVIDENCE where the next evidence up the column is floor, or that to the left and
-    that to the right.
-    """
-    left, right = last_evidence(mask, axis=1)[1], last_evidence(mask[:, ::-1], axis=1)[1][:, ::-1]
-    return (mask == NO_EVIDENCE) & (left & right | below_floor(mask))
 
 
 def beside_something(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -147,15 +135,23 @@ def fill_gaps(
     are near enough to each other, where the images do not contradict the floor (`consistent`).
     """
     height, width = mask.shape
-    disparity = np.nan_to_num(profile.at_rows(np.arange(height) + view.first_row))[:, None]
+    disparity = np.nan_to_num(profile.at_rows(np.arange(height) + view.first_row))
     longest = _GAP_M * view.camera.fx / view.camera.disparity_times_depth * disparity / view.step
-    before, after_floor = last_evidence(mask, axis=1)
-    behind, before_floor = (part[:, ::-1] for part in last_evidence(mask[:, ::-1], axis=1))
+    # All rows in turn, each between two columns that are no floor.
+    bordered = np.pad(mask, ((0, 0), (1, 1)), constant_values=NOT_FLOOR)
+    known = np.flatnonzero(bordered != NO_EVIDENCE)
+    gaps = np.flatnonzero(np.diff(known) > 1)
+    before, behind = known[gaps], known[gaps + 1]
+    row, column = np.divmod(before, width + 2)
+    across = np.minimum(behind - before, width - column)
     # The matcher leaves out some columns at the right border.
-    across = width - 1 - np.maximum(behind, 0) - before
-    at_border = (behind < 0) & (across <= _UNMATCHED_PX // view.step)
-    between = after_floor & (before_floor | at_border)
-    return with_floor(mask, between & (across <= longest) & consistent)
+    at_border = (behind - before > across) & (across <= _UNMATCHED_PX // view.step)
+    fill = (bordered.take(behind) == FLOOR) | at_border
+    fill &= (bordered.take(before) == FLOOR) & (across <= longest[row])
+    steps = np.zeros(bordered.size, np.int8)
+    steps[before[fill] + 1], steps[behind[fill]] = 1, -1
+    filled = np.cumsum(steps, dtype=np.int8).reshape(bordered.shape)[:, 1:-1] > 0
+    return with_floor(mask, filled & consistent)
 
 
 def drop_islands(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -191,24 +187,22 @@ def trim_to_edges(mask: NDArray[np.uint8], slope: NDArray[np.int16]) -> NDArray[
 
 
 def fill_to_contact(
-    view: FloorView,
+    frame: FrameEvidence,
     mask: NDArray[np.uint8],
     alike: NDArray[np.bool_],
     may_begin: NDArray[np.bool_],
-    upright_px: NDArray[np.float32],
-    compared: Comparison,
 ) -> NDArray[np.bool_]:
     """Return where plain floor goes on up to the foot of something upright.
 
-    mask: (R, W). alike, may_begin, upright_px (`upright_above`): where nothing borders, what most
-    of a stretch must be if no floor is seen nearer, and what stands, at half the resolution in both
-    directions of the image, the shape of the result.
+    mask: (R, W). alike, may_begin: where nothing borders, and what most of a stretch must be if no
+    floor is seen nearer, at half the resolution in both directions of the image, the shape of the
+    result.
     """
-    small = mask[view.half]
+    small = mask[frame.view.half]
     open_ = alike & (small == NO_EVIDENCE)
     if not open_.any():
         return open_
-    floor_px = compared.floor_px
+    upright_px, floor_px = frame.upright_px, frame.compared.floor_px
     nearest, farthest = floor_px + np.float32(SAME_PX), np.float32(_BEHIND) * floor_px
     contact = (upright_px < nearest) & (upright_px > farthest - np.float32(SAME_PX))
     bounds = np.where(open_, np.uint8(NO_EVIDENCE), np.where(small == FLOOR, small, NOT_FLOOR))
@@ -220,7 +214,7 @@ def fill_to_contact(
 
 
 def blank_feet(
-    frame: FloorFrame, mask: NDArray[np.uint8]
+    frame: FrameEvidence, mask: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     """Return rows and columns (N,) of the view where blank faces stand on the floor of a mask
     (R, W).

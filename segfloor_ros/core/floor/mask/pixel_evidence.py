@@ -171,8 +171,8 @@ class Heights:
 
 
 @dataclass(frozen=True)
-class FloorFrame:
-    """A frame in which floor is looked for. disparity_px: (R, W), 0 where none is known."""
+class FrameEvidence:
+    """What is known of the pixels of a frame. disparity_px: (R, W), 0 where there is none."""
 
     view: FloorView
     profile: FloorProfile
@@ -196,7 +196,7 @@ class FloorFrame:
         return np.where(good, average, np.float32(np.nan))
 
 
-def judge(frame: FloorFrame, step_m: float) -> NDArray[np.uint8]:
+def judge(frame: FrameEvidence, step_m: float) -> NDArray[np.uint8]:
     """Return a mask (R, W) of what the pixels of a frame say by themselves. step_m: what a robot
     climbs.
 

@@ -7,7 +7,7 @@ from floor_scenes import CAMERA, MOUNT
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.floor.disparity.profile import FloorLine, FloorProfile, FloorView
 from segfloor_ros.core.floor.mask.filling import fill_to_contact
-from segfloor_ros.core.floor.mask.pixel_evidence import Comparison, FloorFrame
+from segfloor_ros.core.floor.mask.pixel_evidence import Comparison, FrameEvidence
 from segfloor_ros.core.floor.pair import Pair
 
 FIRST_ROW = 200
@@ -41,8 +41,8 @@ def filled(
     plain = ~wall[::2, :: 2 // view.step]
     may_begin = (rows >= shape[0] - alike_rows)[::2, :: 2 // view.step]
     pair = Pair(*6 * [None], 0.0, 1.0, texture=np.where(wall & has_texture, 2.0, 0.0))
-    frame = FloorFrame(view, profile, pair, disparity, None, compared)
-    result = fill_to_contact(view, mask, plain, may_begin, frame.upright_px, compared)
+    frame = FrameEvidence(view, profile, pair, disparity, None, compared)
+    result = fill_to_contact(frame, mask, plain, may_begin)
     assert not result[rows[::2, :: 2 // view.step] < CONTACT_ROW].any()
     return result[CONTACT_ROW // 2 : SEEN_ROW // 2]
 
