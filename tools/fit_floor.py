@@ -49,13 +49,14 @@ RIDGE, ROUNDS = 1e-3, 25
 
 
 class Recorder(Likelihood):
-    """Keeps what is seen in the last frame."""
+    """Keeps what is seen in the last frame. rows: of its mask."""
 
     seen: Seen
+    rows: int
 
     def weighed(self, mask: NDArray[np.uint8], seen: Seen) -> NDArray[np.uint8]:
         """Return a mask (R, W) corrected."""
-        self.seen = seen
+        self.seen, self.rows = seen, len(mask)
         return super().weighed(mask, seen)
 
 
@@ -102,7 +103,7 @@ def pixels_of(drive: FloorDrive, configuration: Configuration, rng: np.random.Ge
         if frame.truth is None:
             continue
         seen = recorder.seen
-        part = np.s_[seen.first_row :: STEP_PX, ::STEP_PX]
+        part = np.s_[-recorder.rows :: STEP_PX, ::STEP_PX]
         label, known = frame.truth.label[part], known_weight(seen)
         counts = (label != UNKNOWN) & (seen.floor_px > SAME_PX) & (known > LEAST_KNOWN)
         if frame.moving is not None:

@@ -12,10 +12,12 @@ from unittest import mock
 import numpy as np
 
 from segfloor_ros.core.configuration import Configuration
-from segfloor_ros.core.floor.mask.filling import fill_regions, fill_to_contact, upright_above
+from segfloor_ros.core.floor.mask.filling import fill_to_contact
+from segfloor_ros.core.floor.mask.pixel_evidence import FrameEvidence
 
 ROOM = 'segfloor_ros.'
 NOTHING = 'nothing'
+_UPRIGHT_PX = FrameEvidence.__dict__['upright_px']
 
 
 @dataclass(frozen=True)
@@ -68,26 +70,13 @@ def _nowhere(like: Any, *_: object) -> Any:
     return np.zeros(like.shape, np.bool_)
 
 
-def _above_anything(view: Any, disparity: Any, compared: Any, textured: Any) -> Any:
-    return upright_above(view, disparity, compared, np.ones_like(textured))
+def _above_anything(frame: FrameEvidence) -> Any:
+    textured = dataclasses.replace(frame.pair, texture=np.full_like(frame.pair.texture, np.inf))
+    return _UPRIGHT_PX.func(dataclasses.replace(frame, pair=textured))
 
 
-def _filled_whatever_stands(
-    view: Any,
-    mask: Any,
-    slope: Any,
-    upright_px: Any,
-    compared: Any,
-    textured: Any,
-    standing: Any,
-    *others: Any,
-) -> Any:
-    shapes = view, mask, slope, upright_px, compared, textured
-    return fill_regions(*shapes, _nowhere(standing), *others)
-
-
-def _begun_anywhere(view: Any, mask: Any, alike: Any, may_begin: Any, *others: Any) -> Any:
-    return fill_to_contact(view, mask, alike, np.ones_like(may_begin), *others)
+def _begun_anywhere(frame: Any, mask: Any, alike: Any, may_begin: Any) -> Any:
+    return fill_to_contact(frame, mask, alike, np.ones_like(may_begin))
 
 
 SLAM: dict[str, Mechanism] = {
@@ -174,13 +163,13 @@ FLOOR: dict[str, Mechanism] = {
     'swings over bumps': Mechanism({'core.floor.plane.plane.PROPOSALS': 0}),
     'guard at the right border': Mechanism({'core.floor.segmentation._BORDER_BLOCKS': 0}),
     'floor up to contacts': Mechanism(
-        {'core.floor.mask.filling.fill_to_contact': lambda view, mask, alike, *_: _nowhere(alike)}
+        {'core.floor.mask.filling.fill_to_contact': lambda frame, mask, alike, _: _nowhere(alike)}
     ),
     'what the image cuts off looks like floor': Mechanism(
         {'core.floor.mask.filling.fill_to_contact': _begun_anywhere}
     ),
     'contacts with what has texture alone': Mechanism(
-        {'core.floor.segmentation.upright_above': _above_anything}
+        {'core.floor.mask.pixel_evidence.FrameEvidence.upright_px': property(_above_anything)}
     ),
     'feet of blank faces': Mechanism(
         {'core.floor.segmentation.blank_feet': lambda *_: (np.zeros(0, np.float32), _no_rows())}
@@ -189,7 +178,7 @@ FLOOR: dict[str, Mechanism] = {
     'noise stands nowhere': Mechanism({'core.floor.segmentation._LEAST_SHARE': 0.0}),
     'boards count twice': Mechanism({'core.floor.segmentation._BOARD': 1}),
     'filling of regions': Mechanism(
-        {'core.floor.segmentation.fill_regions': lambda view, mask, *_: mask}
+        {'core.floor.segmentation.fill_regions': lambda frame, mask, *_: mask}
     ),
     'filling of gaps': Mechanism(
         {'core.floor.segmentation.fill_gaps': lambda view, profile, mask, *_: mask}
@@ -211,10 +200,18 @@ FLOOR: dict[str, Mechanism] = {
         {'core.floor.segmentation.beside_something': lambda view, mask: _nowhere(mask)}
     ),
     'floor beside the profile': Mechanism(
-        {'core.floor.segmentation.lies_on_floor': lambda view, disparity, _: _nowhere(disparity)}
+        {
+            'core.floor.mask.pixel_evidence.lies_on_floor': lambda view, disparity, _: _nowhere(
+                disparity
+            )
+        }
     ),
     'what stands is not filled': Mechanism(
-        {'core.floor.segmentation.fill_regions': _filled_whatever_stands}
+        {
+            'core.floor.mask.pixel_evidence.Heights.standing': property(
+                lambda self: _nowhere(self.height)
+            )
+        }
     ),
     'trimming to edges': Mechanism({'core.floor.segmentation.trim_to_edges': _first}),
     'what hangs at the height of the robot': Mechanism(

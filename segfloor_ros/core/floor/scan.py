@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.camera.pixels import SUBPIXEL, shrunk
+from segfloor_ros.core.camera.pixels import SUBPIXEL, shrunk, shrunk_image
 from segfloor_ros.core.contracts import RANGE_MAX_ERROR_M, SAME_SURFACE_SHARE, FloorScan, Mount
 from segfloor_ros.core.floor.disparity.matching import (
     COARSE_BLOCK_PX,
@@ -24,7 +24,8 @@ from segfloor_ros.core.floor.disparity.matching import (
     SPECKLE_PX,
     DisparityMatcher,
 )
-from segfloor_ros.core.floor.mask.pixel_evidence import texture_grey
+from segfloor_ros.core.floor.disparity.profile import STEP_PX, histogram
+from segfloor_ros.core.floor.pair import Pair, texture_grey
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.geometry import Array, transform_points
 
@@ -37,8 +38,6 @@ _CONTACT_ROWS = 2.5
 """So many rows may be missing where the floor meets what stands on it."""
 _FADING_ROWS = 1.5
 """So many rows are taken off where nothing shows why the floor ends."""
-_GAP_ROWS = _CONTACT_ROWS + _FADING_ROWS
-"""So many image rows of floor may be missing, however many metres they are."""
 _DIP_BEARINGS = 5
 _NARROW_M, _GAP_BEARINGS = 0.2, (5, 9, 17, 33)
 """Gaps between things are closed up to this width, in these numbers of bearings."""
@@ -49,7 +48,6 @@ _SPREAD_BINS = round(SAME_SURFACE_SHARE / _LOG_STEP)
 _NEAREST_M = 0.1
 _MEDIAN_ROUNDS = 3
 
-_SCALE = 2
 _SEEN_BEFORE_M = 0.5
 """What is nearer than this has been seen before."""
 _TEXTURE_WINDOW_PX = 7
@@ -58,7 +56,9 @@ _BOARD_SHARE = 0.04
 
 
 class FloorScanner:
-    """Makes the scans of one camera on one mount."""
+    """Makes the scans of one camera on one mount. cells_xy: where it looks for floor, (2, N) in the
+    base's x-y plane: at every bearing in turn all ranges.
+    """
 
     def __init__(
         self, camera: StereoCamera, mount: Mount, settings: FloorSegmentationSettings
@@ -86,14 +86,7 @@ class FloorScanner:
         bearings = self._angle_min + step * np.arange(self._count)
         directions = np.stack([np.cos(bearings), np.sin(bearings)])
         cells = directions[:, :, None] * self._middle
-        self._cells_xy = cells.reshape(2, -1).astype(np.float32)
-
-    @property
-    def cells_xy(self) -> NDArray[np.float32]:
-        """Where the scan looks for floor, (2, N) in the base's x-y plane: at every bearing in
-        turn all ranges.
-        """
-        return self._cells_xy
+        self.cells_xy: NDArray[np.float32] = cells.reshape(2, -1).astype(np.float32)
 
     def scan(
         self,
@@ -168,10 +161,6 @@ class FloorScanner:
             limit: Array = 1 / near
         return limit
 
-    def _tolerance(self, range_m: Array) -> Array:
-        """Return how long a gap in the floor may be at a range."""
-        return np.maximum(self._gap_m, _GAP_ROWS * self._row_m(range_m))
-
     def _row_m(self, range_m: Array) -> Array:
         """Return how much floor one image row shows at a range."""
         return range_m**2 / (self._height_m * self._camera.fy)
@@ -185,7 +174,10 @@ class FloorScanner:
         last = np.maximum.accumulate(np.where(seen, middle, 0.0), axis=1)
         previous = np.concatenate([np.zeros((self._count, 1)), last[:, :-1]], axis=1)
         previous = np.maximum(previous, self._nearest[:, None])
-        broken = seen & (middle - previous > self._tolerance(middle))
+        # So many image rows may be missing, however many metres they are.
+        rows_m = (_CONTACT_ROWS + _FADING_ROWS) * self._row_m(middle)
+        tolerated = np.maximum(self._gap_m, rows_m)
+        broken = seen & (middle - previous > tolerated)
         unbroken = np.cumsum(broken, axis=1) == 0
         return np.where(seen & unbroken & may_end, middle, 0.0).max(axis=1)
 
@@ -234,12 +226,11 @@ class FloorScanner:
         """Return how many points (2, M) lie at every bearing in bins of the same share of the
         range.
         """
-        n, m = self._count, len(self._log_bins)
+        shape = self._count, len(self._log_bins)
         ranges = np.maximum(np.hypot(xy[0], xy[1]), _NEAREST_M)
         bins = (np.log(ranges * (1 / _NEAREST_M)) * (1 / _LOG_STEP)).astype(np.intp)
-        near = bins < m
-        cell = self._bearing_index(xy[:, near]) * m + bins[near]
-        return np.bincount(cell, minlength=n * m).reshape(n, m)
+        near = bins < shape[1]
+        return histogram(self._bearing_index(xy[:, near]), bins[near], shape)
 
 
 def _median_bin(total: NDArray[np.int32], begin: NDArray[np.intp], end: NDArray[np.intp]) -> Array:
@@ -258,15 +249,9 @@ def _floor_on_border(camera: StereoCamera, mount: Mount) -> Array:
     """Return where the rays along the image's left, right and lower border meet the floor, (N, 2)
     in the base's x-y plane.
     """
-    columns = np.arange(camera.width, dtype=np.float64)
-    rows = np.arange(camera.height, dtype=np.float64)
-    uv = np.concatenate(
-        [
-            np.stack([columns, np.full(camera.width, camera.height - 1.0)], 1),
-            np.stack([np.zeros(camera.height), rows], 1),
-            np.stack([np.full(camera.height, camera.width - 1.0), rows], 1),
-        ]
-    )
+    columns, rows = np.arange(camera.width), np.arange(camera.height)
+    borders = (columns, rows[-1]), (columns[0], rows), (columns[-1], rows)
+    uv = np.hstack([np.broadcast_arrays(*border) for border in borders]).T.astype(np.float64)
     T_base_left = mount.T_base_left
     rays = camera.back_project(uv, np.ones(len(uv))) @ T_base_left[:3, :3].T
     rays = rays[rays[:, 2] < -1e-3]
@@ -281,52 +266,38 @@ class OverheadMatcher:
     ) -> None:
         self._camera, self._settings = camera, settings
         nearest_px = min(num_disparities, camera.disparity_times_depth / _SEEN_BEFORE_M)
-        searched = math.ceil(nearest_px / (_SCALE * SUBPIXEL)) * SUBPIXEL
-        self._matcher = DisparityMatcher(searched, COARSE_BLOCK_PX, SPECKLE_PX // _SCALE**2)
+        searched = math.ceil(nearest_px / (STEP_PX * SUBPIXEL)) * SUBPIXEL
+        self._matcher = DisparityMatcher(searched, COARSE_BLOCK_PX, SPECKLE_PX // STEP_PX**2)
 
-    def positions(
-        self,
-        left: NDArray[np.uint8],
-        right: NDArray[np.uint8],
-        mount: Mount,
-        horizon_row: int,
-        min_texture_grey: float,
-        moving: NDArray[np.uint8] | None = None,
-        measured: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:
-        """Return where in the base's x-y plane something is in the way, (2, N), by the rows above
-        `horizon_row` of a rectified pair (H, W); every fourth pixel at most tells.
-
-        mount: of this frame. min_texture_grey: what a disparity needs to mean something. moving:
-        mask (H, W), 255 where what stands there moves and does not count. measured: disparity
-        (H, W) of a depth camera.
+    def positions(self, pair: Pair, mount: Mount) -> NDArray[np.float32]:
+        """Return where in the base's x-y plane something is in the way, (2, N), by the rows of a
+        pair above those that can show floor; every fourth pixel at most tells. mount: of this
+        frame.
         """
-        camera = self._camera
+        camera, horizon_row = self._camera, pair.first_row
         reach = (self._settings.robot_height_m - mount.height_m) / _SEEN_BEFORE_M * camera.fy
-        first = max(0, horizon_row - int(max(reach, 0.0))) // _SCALE * _SCALE
-        last = first + (horizon_row - first) // _SCALE * _SCALE
+        first = max(0, horizon_row - int(max(reach, 0.0))) // STEP_PX * STEP_PX
+        last = first + (horizon_row - first) // STEP_PX * STEP_PX
         if last - first < RUN_UP_ROWS:
             return np.zeros((2, 0), np.float32)
-        size = (camera.width // _SCALE, (last - first) // _SCALE)
-        halves = [
-            cv2.resize(image[first:last], size, interpolation=cv2.INTER_AREA)
-            for image in (left, right)
-        ]
-        if measured is None:
-            disparity = self._matcher.compute(halves[0], halves[1])
+        rows = slice(first, last)
+        left, right = (shrunk_image(image[rows], STEP_PX) for image in (pair.left, pair.right))
+        size = left.shape[::-1]
+        if pair.measured is None:
+            disparity = self._matcher.compute(left, right)
             # A slope along the row gets steeper as the image gets smaller.
-            textured = texture_grey(halves[0], _TEXTURE_WINDOW_PX) > _SCALE * min_texture_grey
+            textured = texture_grey(left, _TEXTURE_WINDOW_PX) > STEP_PX * pair.enough
             known = (disparity > 0) & ~_fringes(disparity)
             certain = _with_boards(disparity, known, known & textured)
         else:
-            disparity = shrunk(measured[first:last], size)
+            disparity = shrunk(pair.measured[rows], size)
             certain = disparity > 0
-        if moving is not None:
-            certain &= cv2.resize(moving[first:last], size, interpolation=cv2.INTER_NEAREST) == 0
-        rows, columns = np.nonzero(certain)
-        disparity_px = _SCALE * disparity[rows, columns].astype(np.float64)
-        centre = 0.5 * (_SCALE - 1)
-        uv_px = np.stack([_SCALE * columns + centre, _SCALE * rows + first + centre], axis=1)
+        if pair.moving is not None:
+            certain &= cv2.resize(pair.moving[rows], size, interpolation=cv2.INTER_NEAREST) == 0
+        v, u = np.nonzero(certain)
+        disparity_px = STEP_PX * disparity[v, u].astype(np.float64)
+        centre = 0.5 * (STEP_PX - 1)
+        uv_px = np.stack([STEP_PX * u + centre, STEP_PX * v + first + centre], axis=1)
         return self.in_the_way(uv_px, disparity_px, mount)
 
     def in_the_way(self, uv_px: Array, disparity_px: Array, mount: Mount) -> NDArray[np.float32]:

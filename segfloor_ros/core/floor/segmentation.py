@@ -22,20 +22,10 @@ from segfloor_ros.core.contracts import (
     FloorObservation,
     FloorScan,
     Mount,
-    VDisparity,
 )
-from segfloor_ros.core.floor.disparity.matching import (
-    BLOCK_PX,
-    MEAN_NOISE,
-    NOISE_PX,
-    SIGMAS,
-    TwoScaleMatcher,
-    disparity_range,
-)
+from segfloor_ros.core.floor.disparity.matching import BLOCK_PX, TwoScaleMatcher, disparity_range
 from segfloor_ros.core.floor.disparity.profile import (
-    BINS_PER_PX,
     STEP_PX,
-    FloorProfile,
     FloorView,
     column_step,
     filtered_v_disparity,
@@ -51,25 +41,17 @@ from segfloor_ros.core.floor.mask.filling import (
     drop_islands,
     fill_gaps,
     fill_regions,
-    image_slope,
     trim_to_edges,
-    upright_above,
 )
 from segfloor_ros.core.floor.mask.likelihood import Likelihood, Seen
 from segfloor_ros.core.floor.mask.look import unlike_floor
 from segfloor_ros.core.floor.mask.painting import with_floor, without_floor
 from segfloor_ros.core.floor.mask.pixel_evidence import (
-    TEXTURE_WINDOW_PX,
-    Comparison,
-    Evidence,
+    FrameEvidence,
     Heights,
-    HeightTable,
     below_floor,
     compare,
-    compare_measured,
     judge,
-    lies_on_floor,
-    mean_height,
 )
 from segfloor_ros.core.floor.pair import Pair
 from segfloor_ros.core.floor.plane.plane import PROVED, Fixture, expectations, plane_of_frame
@@ -82,8 +64,7 @@ DISPARITY, DISPARITY_ABOVE = 'disparity', 'disparity above the horizon'
 _BORDER_BLOCKS = 2
 """So near to the border of the right image, in blocks that are matched, matches are unsure."""
 _LEAST_SHARE = 0.5
-"""What has less than this share of the texture that a floor needs shows noise, and stands nowhere.
-"""
+"""What has a smaller share of the texture that a floor needs shows noise, and stands nowhere."""
 _BOARD = 2
 """Table tops are thinner than what stands: so many times what is seen of them counts."""
 
@@ -107,9 +88,6 @@ class FloorSegmentation:
         self._border = BlankBorder()
         self._mount: Mount | None = None
         self.fixture = Fixture()
-        self._matcher: TwoScaleMatcher
-        self._overhead: OverheadMatcher
-        self._scanner: FloorScanner
 
     def process(
         self,
@@ -136,7 +114,8 @@ class FloorSegmentation:
         expected = np.vstack([expected, self.fixture.usual(expected[0])])
         with measure('texture'):
             part = self._part(mount, expected)
-            pair = Pair.of(left, right, self._hidden(left, moving, said), said, part)
+            hidden = union(moving, self._border.see(left))
+            pair = Pair.of(left, right, hidden, said, part)
         with measure(DISPARITY):
             disparity, movable = self._disparities(pair)
             below = disparity[part]
@@ -144,30 +123,37 @@ class FloorSegmentation:
             angles_height, is_shown = self._plane(pair, below, expected)
         view = FloorView.of(self._camera, _with_angles(mount, angles_height), pair.first_row)
         with measure('profile'):
-            counted = self._counted(view, pair, below)
+            clear, searched = pair.texture > 2 * pair.enough, self._matcher.num_disparities
+            counted = filtered_v_disparity(view, below, clear, searched)
             profile = fit_profile(counted, view.line, self._camera)
         with measure('comparison'):
-            heights = self._heights(view, profile, pair, below)
-            compared = _compared(view, profile, pair, below, heights)
+            heights = Heights.of(view, profile, pair, below, searched, self._settings)
+            compared = compare(view, profile, pair, below, heights)
+            frame = FrameEvidence(view, profile, pair, below, heights, compared)
         with measure('evidence'):
-            evidence = _evidence(view, pair, below, compared, heights, self._settings.step_height_m)
+            judged, odd = _judged(frame, self._settings.step_height_m)
         with measure('filling'):
-            mask = self._fill(view, profile, pair, below, evidence, compared)
+            mask = self._fill(frame, judged, odd)
         with measure('likelihood'):
-            seen = _seen(view, pair, below, compared, heights, mask)
-            mask = drop_islands(self.likelihood.weighed(mask, seen))
+            mask = drop_islands(self.likelihood.weighed(mask, _seen(frame, mask)))
             if not is_shown:
                 mask[mask == FLOOR] = NO_EVIDENCE
             mask = pair.without_hidden(mask)
         with measure(DISPARITY_ABOVE):
-            hanging_xy = self._hanging(view, pair)
+            hanging_xy = self._overhead.positions(pair, view.mount)
         with measure('scan'):
-            feet_xy = _feet(view, profile, pair, mask)
             movable_xy = None if movable is None else self._positions(view, movable)
-            scan = self._scan(view, profile, below, evidence, mask, hanging_xy, feet_xy, movable_xy)
+            scan = self._scan(frame, judged, mask, hanging_xy, movable_xy)
         if movable is not None:
             disparity = np.maximum(disparity, movable)
-        return self._observation(view, profile, disparity, mask, scan, counted)
+        return FloorObservation(
+            disparity_px=disparity,
+            mask=_whole(view, mask),
+            profile_px=profile.at_rows(np.arange(self._camera.height)).astype(np.float64),
+            scan=scan,
+            max_disparity_px=max(float(searched), float(disparity.max())),
+            v_disparity=counted,
+        )
 
     @property
     def remarks(self) -> dict[str, str]:
@@ -179,18 +165,6 @@ class FloorSegmentation:
         """Return the rows and columns of the image that are looked at."""
         first_row = min(first_floor_row(self._camera, _with_angles(mount, one)) for one in expected)
         return np.s_[first_row:, :: column_step(self._camera)]
-
-    def _hidden(
-        self,
-        left: NDArray[np.uint8],
-        moving: NDArray[np.uint8] | None,
-        said: NDArray[np.uint8] | None,
-    ) -> NDArray[np.uint8] | None:
-        """Return the mask (H, W) of what does not count: the border, and what moves."""
-        hidden = union(moving, self._border.see(left))
-        if said is None:
-            return hidden
-        return union(hidden, np.where(said == MOVING, np.uint8(255), np.uint8(0)))
 
     def _disparities(self, pair: Pair) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """Return the disparity (H, W) of what counts, and that of what a network says moves."""
@@ -214,46 +188,6 @@ class FloorSegmentation:
         is_lost = is_fixed and not is_proved
         self.fixture.note(plane_of_frame(*looked, is_fixed=False) if is_lost else fit)
         return fit.angles_height, is_fixed or is_proved
-
-    def _counted(self, view: FloorView, pair: Pair, below: NDArray[np.float32]) -> VDisparity:
-        clear = pair.texture > 2 * pair.enough
-        return filtered_v_disparity(view, below, clear, self._matcher.num_disparities, BINS_PER_PX)
-
-    def _heights(
-        self, view: FloorView, profile: FloorProfile, pair: Pair, below: NDArray[np.float32]
-    ) -> Heights:
-        constant = None if pair.measured is None else self._camera.disparity_times_depth
-        most = self._matcher.num_disparities
-        table = HeightTable.of(view.line, profile, most, self._settings, constant)
-        return Heights.of(view, table, below)
-
-    def _hanging(self, view: FloorView, pair: Pair) -> NDArray[np.float32]:
-        """Return what is in the way above the horizon, (2, N) in the base's x-y plane."""
-        given = pair.first_row, pair.enough, pair.moving, pair.measured
-        return self._overhead.positions(pair.left, pair.right, view.mount, *given)
-
-    def _observation(
-        self,
-        view: FloorView,
-        profile: FloorProfile,
-        disparity: NDArray[np.float32],
-        mask: NDArray[np.uint8],
-        scan: FloorScan,
-        counted: VDisparity,
-    ) -> FloorObservation:
-        rows = np.arange(self._camera.height, dtype=np.float64)
-        whole = np.full(disparity.shape, NOT_FLOOR, np.uint8)
-        # On a bump the floor may reach higher than was looked for.
-        whole[max(0, int(view.line.horizon)) : view.first_row] = NO_EVIDENCE
-        whole[view.first_row :] = np.repeat(mask, view.step, axis=1)[:, : self._camera.width]
-        return FloorObservation(
-            disparity_px=disparity,
-            mask=whole,
-            profile_px=profile.at_rows(rows).astype(np.float64),
-            scan=scan,
-            max_disparity_px=max(float(self._matcher.num_disparities), float(disparity.max())),
-            v_disparity=counted,
-        )
 
     def change_settings(self, settings: FloorSegmentationSettings) -> None:
         """Segment with changed settings from now on."""
@@ -283,67 +217,53 @@ class FloorSegmentation:
         return disparity
 
     def _fill(
-        self,
-        view: FloorView,
-        profile: FloorProfile,
-        pair: Pair,
-        disparity: NDArray[np.float32],
-        evidence: Evidence,
-        compared: Comparison,
+        self, frame: FrameEvidence, judged: NDArray[np.uint8], looks_odd: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
         """Return the mask with floor where this pair of images alone cannot tell: where it looks
         like floor. The more floor is known the better is known how it looks, so this is done twice,
         and what then does not look like it is floor only if it was measured. Nor does it contradict
         a network that was right so far.
         """
-        mask, odd, said, textured = evidence.mask, evidence.odd, pair.said_there, pair.textured
+        view, pair, consistent = frame.view, frame.pair, frame.compared.consistent
+        mask, odd, off = judged, looks_odd, frame.heights.mean_off
         beside = beside_something(view, mask)
-        left = np.ascontiguousarray(pair.left[pair.part])
-        slope = image_slope(pair.left_rows)
-        upright_px = upright_above(view, disparity, compared, textured)
         for _ in range(2):
-            mask = fill_regions(
-                view, mask, slope, upright_px, compared, textured, evidence.standing, beside, odd
-            )
-            may_be = compared.consistent & ~compared.denied & ~(beside | odd)
-            mask = fill_gaps(view, profile, mask, may_be)
-            unlike = unlike_floor(left, mask == FLOOR)
-            odd = unlike & (evidence.off | evidence.odd)
-            mask = without_floor(mask, unlike & evidence.off & textured)
-        if said is not None:
-            self.network.note(said, mask)
-        if said is not None and self.network.is_trusted:
-            undenied = compared.consistent & ~compared.denied
-            mask = with_floor(mask, (said == FLOOR) & undenied)
+            mask = fill_regions(frame, mask, beside, odd)
+            mask = fill_gaps(view, frame.profile, mask, consistent & ~(beside | odd))
+            unlike = unlike_floor(pair.left[pair.part], mask == FLOOR)
+            odd = unlike & (off | looks_odd)
+            mask = without_floor(mask, unlike & off & pair.textured)
+        if pair.said_there is not None:
+            self.network.note(pair.said_there, mask)
+            if self.network.is_trusted:
+                mask = with_floor(mask, (pair.said_there == FLOOR) & consistent)
         return mask
 
     def _scan(
         self,
-        view: FloorView,
-        profile: FloorProfile,
-        disparity: NDArray[np.float32],
-        evidence: Evidence,
+        frame: FrameEvidence,
+        judged: NDArray[np.uint8],
         mask: NDArray[np.uint8],
         hanging_xy: NDArray[np.float32],
-        feet_xy: NDArray[np.float32],
         movable_xy: NDArray[np.float32] | None,
     ) -> FloorScan:
-        """Return the scan. hanging_xy, feet_xy, movable_xy: (2, N), what is in the way above the
-        horizon, where blank faces stand, and what is of a class that moves.
+        """Return the scan. judged, mask: (R, W), before and after what is blank was filled.
+        hanging_xy, movable_xy: (2, N), what is in the way above the horizon,
+        and what is of a class that moves.
         """
-        standing = (evidence.mask[::2] == NOT_FLOOR) & evidence.above[::2]
-        rows, columns = pixels_where(standing)
+        view, pair = frame.view, frame.pair
+        above = (frame.heights.height > 0) & (pair.texture >= _LEAST_SHARE * pair.enough)
+        rows, columns = pixels_where(((judged == NOT_FLOOR) & above)[::2])
         rows *= 2
-        upright_xy = view.positions(rows, columns, disparity[rows, columns])
-        v, u, floor_px = view.pixels_of_profile(self._scanner.cells_xy, profile)
+        upright_xy = view.positions(rows, columns, frame.disparity_px[rows, columns])
+        v, u, floor_px = view.pixels_of_profile(self._scanner.cells_xy, frame.profile)
         floor = (v >= 0) & (v < mask.shape[0]) & (u >= 0) & (u < mask.shape[1])
         floor &= mask.take(v * np.int32(mask.shape[1]) + u, mode='clip') == FLOOR
-        border_px = np.float32(_BORDER_BLOCKS * BLOCK_PX)
-        shared = u * view.step >= floor_px + border_px
+        shared = u * view.step >= floor_px + np.float32(_BORDER_BLOCKS * BLOCK_PX)
         # At half the resolution a pixel tells of four, here of two or, in every other column, four.
         hanging_xy = np.repeat(hanging_xy, _BOARD * 2 // view.step, axis=1)
         upright_xy = np.hstack([upright_xy, hanging_xy])
-        density = 1 / (2 * view.step)
+        feet_xy, density = _feet(frame, mask), 1 / (2 * view.step)
         return self._scanner.scan(floor, shared, upright_xy, feet_xy, density, movable_xy)
 
     def _positions(self, view: FloorView, disparity: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -356,93 +276,66 @@ class FloorSegmentation:
         return self._overhead.in_the_way(uv_px.astype(float), at.astype(float), view.mount)
 
 
-def _compared(
-    view: FloorView, profile: FloorProfile, pair: Pair, below: NDArray[np.float32], heights: Heights
-) -> Comparison:
-    on_floor = lies_on_floor(view, below, heights)
-    if pair.measured is not None:
-        return compare_measured(view, profile, below, on_floor, NOISE_PX)
-    return compare(view, profile, pair.left_rows, pair.right_rows, below, on_floor, pair.noise_grey)
-
-
-def _evidence(
-    view: FloorView,
-    pair: Pair,
-    below: NDArray[np.float32],
-    compared: Comparison,
-    heights: Heights,
-    step_m: float,
-) -> Evidence:
-    """Return what the pixels (R, W) of the view say by themselves, cut back to edges, and left
-    open where they do not look like floor and are not measured to lie on it; and what a network
-    says stands there.
+def _judged(frame: FrameEvidence, step_m: float) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Return a mask (R, W) of what the pixels of a frame say by themselves, cut back to edges, and
+    left open where they do not look like floor and are not measured to lie on it; and of what a
+    network says stands there; and what does not look like floor (R, W). step_m: what a robot
+    climbs.
     """
-    mask = judge(view, below, pair.textured, compared, heights, step_m)
-    seen = trim_to_edges(mask, pair.slope, TEXTURE_WINDOW_PX // 2 + 3)
-    left = pair.left[pair.part]
-    odd, sigmas = unlike_floor(left, seen == FLOOR), mean_height(heights)
-    off, standing = np.abs(sigmas) > SIGMAS * MEAN_NOISE, sigmas > SIGMAS
-    doubtful = (seen == FLOOR) & odd
-    seen[doubtful] = NO_EVIDENCE
-    seen[doubtful & ~off & below_floor(seen)] = FLOOR
-    above = (heights.height > 0) & (pair.texture >= _LEAST_SHARE * pair.enough)
-    seen = pair.without_hidden(seen)
+    pair = frame.pair
+    mask = trim_to_edges(judge(frame, step_m), pair.slope)
+    odd = unlike_floor(pair.left[pair.part], mask == FLOOR)
+    doubtful = (mask == FLOOR) & odd
+    mask = without_floor(mask, doubtful)
+    mask = with_floor(mask, doubtful & ~frame.heights.mean_off & below_floor(mask))
+    mask = pair.without_hidden(mask)
     if pair.said_there is not None:
-        seen[pair.said_there == NOT_FLOOR] = NOT_FLOOR
-    return Evidence(seen, above, off, standing, odd)
+        mask[pair.said_there == NOT_FLOOR] = NOT_FLOOR
+    return mask, odd
 
 
-def _seen(
-    view: FloorView,
-    pair: Pair,
-    below: NDArray[np.float32],
-    compared: Comparison,
-    heights: Heights,
-    mask: NDArray[np.uint8],
-) -> Seen:
-    part = np.s_[::STEP_PX, :: STEP_PX // view.step]
+def _seen(frame: FrameEvidence, mask: NDArray[np.uint8]) -> Seen:
+    """Return what the likelihood weighs. mask: (R, W), with what is floor so far."""
+    pair, heights, compared, half = frame.pair, frame.heights, frame.compared, frame.view.half
     grey = cv2.blur(pair.left_rows, (BLOCK_PX, BLOCK_PX))[::STEP_PX, ::STEP_PX]
     return Seen(
-        first_row=view.first_row,
         floor_px=compared.floor_px,
-        disparity_px=below[part],
-        slope=view.line.slope,
-        texture=(pair.texture / pair.enough)[part],
-        lower=(heights.off & ~heights.above)[part],
+        disparity_px=frame.disparity_px[half],
+        slope=frame.view.line.slope,
+        texture=pair.texture[half] / pair.enough,
+        lower=(heights.off & ~heights.above)[half],
         grey=grey.astype(np.float32),
-        costs=compared.costs,
-        noise_grey=pair.noise_grey,
-        is_floor=mask[part] == FLOOR,
+        better=compared.better,
+        noise_grey=pair.noise_grey if pair.measured is None else 0.0,
+        is_floor=mask[half] == FLOOR,
     )
 
 
-def _feet(
-    view: FloorView, profile: FloorProfile, pair: Pair, mask: NDArray[np.uint8]
-) -> NDArray[np.float32]:
-    """Return where blank faces stand, and what a network says stands, (2, N) in the base's x-y
-    plane.
+def _feet(frame: FrameEvidence, mask: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return where blank faces stand, and what a network says stands, whatever its depth: its
+    lowest pixel in each column, unless the image ends; (2, N) in the base's x-y plane.
     """
-    rows, columns = blank_feet(view, mask, pair.slope, pair.textured)
+    view, said = frame.view, frame.pair.said_there
+    rows, columns = blank_feet(frame, mask)
+    if said is not None:
+        stands = said[::-1] == NOT_FLOOR
+        lowest = len(said) - 1 - stands.argmax(axis=0)
+        found = np.flatnonzero(stands.any(axis=0) & ~stands[0])
+        rows, columns = np.append(rows, lowest[found]), np.append(columns, found)
     derolled = rows + view.shear_px[columns] + view.first_row
-    blank_xy = view.positions(rows, columns, profile.at_rows(derolled).astype(np.float32))
-    if pair.said_there is None:
-        return blank_xy
-    return np.hstack([blank_xy, _barriers(view, profile, pair.said_there)])
+    floor_px = frame.profile.at_rows(derolled).astype(np.float32)
+    is_below = floor_px > 0
+    return view.positions(rows[is_below], columns[is_below], floor_px[is_below])
 
 
-def _barriers(
-    view: FloorView, profile: FloorProfile, said: NDArray[np.uint8]
-) -> NDArray[np.float32]:
-    """Return where what stands there whatever its depth, of what a network says (R, W), meets the
-    floor, (2, N) in the base's x-y plane: its lowest pixel in each column, unless the image ends.
+def _whole(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the mask (H, W) of the image: nothing above the horizon is floor, but on a bump the
+    floor may reach higher than was looked for.
     """
-    rows = said.shape[0] - 1 - (said[::-1] == NOT_FLOOR).argmax(axis=0)
-    found = np.flatnonzero((said == NOT_FLOOR).any(axis=0) & (rows < said.shape[0] - 1))
-    rows = rows[found]
-    derolled = rows + view.shear_px[found] + view.first_row
-    floor_px = profile.at_rows(derolled).astype(np.float32)
-    below = floor_px > 0
-    return view.positions(rows[below], found[below], floor_px[below])
+    whole = np.full((view.camera.height, view.camera.width), NOT_FLOOR, np.uint8)
+    whole[max(0, int(view.line.horizon)) : view.first_row] = NO_EVIDENCE
+    whole[view.first_row :] = np.repeat(mask, view.step, axis=1)[:, : view.camera.width]
+    return whole
 
 
 def _with_angles(mount: Mount, angles_height: Array) -> Mount:

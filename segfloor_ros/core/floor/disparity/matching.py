@@ -8,14 +8,13 @@ disparities are large, and an error of twice as many pixels is still a small sha
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.model import StereoCamera, is_disparity
-from segfloor_ros.core.camera.pixels import SUBPIXEL, seen_from_right
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.pixels import SUBPIXEL, shrunk_image
 from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.geometry import Array
 
@@ -50,8 +49,6 @@ _OVERLAP_PX = 4
 """So near to the end of its range the fine match leaves what is nearer to the coarse one."""
 RUN_UP_ROWS = 16
 """The matcher's paths get a run-up, and the horizon some play."""
-_RUN_OUT_ROWS = 8
-"""The matcher's blocks and paths reach beyond the last fine row."""
 
 
 def disparity_range(camera: StereoCamera, mount: Mount | None, share: float = 1.15) -> int:
@@ -82,17 +79,6 @@ def equal_exposure(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray
         return right
     adapted = right.astype(np.float32) * np.float32(gain) + np.float32(offset)
     return np.clip(np.rint(adapted), 0, 255).astype(np.uint8)
-
-
-def stereo_view(
-    left: NDArray[np.uint8], right: NDArray[Any]
-) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None]:
-    """Return the right image (H, W), as bright as the left one, and None; of a depth camera, which
-    has a disparity in its place, what a right camera would see, and the disparity, 0 for holes.
-    """
-    if not is_disparity(right):
-        return equal_exposure(left, right), None
-    return seen_from_right(left, right), np.nan_to_num(right, nan=0.0)
 
 
 class DisparityMatcher:
@@ -140,26 +126,6 @@ class DisparityMatcher:
         columns = np.arange(disparity.shape[1], dtype=np.float32)
         disparity[disparity > columns + 0.5] = 0
         return disparity
-
-
-def halved_disparity(
-    matcher: DisparityMatcher, left: NDArray[np.uint8], right: NDArray[np.uint8]
-) -> NDArray[np.float32]:
-    """Return the disparities (H, W) of a pair, matched at half its resolution; 0 where there is no
-    match.
-    """
-    height, width = (size // 2 for size in left.shape)
-    halves = [
-        cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
-        for image in (left, right)
-    ]
-    disparity = np.zeros(left.shape, np.float32)
-    disparity[: 2 * height, : 2 * width] = cv2.resize(
-        2 * matcher.compute(halves[0], halves[1]),
-        (2 * width, 2 * height),
-        interpolation=cv2.INTER_NEAREST,
-    )
-    return disparity
 
 
 def refined(
@@ -239,10 +205,14 @@ class TwoScaleMatcher:
         """
         if self._coarse is None:
             return self._fine.compute(left, right)
-        disparity = halved_disparity(self._coarse, left, right)
+        found = self._coarse.compute(*(shrunk_image(image, 2) for image in (left, right)))
+        found = 2 * found.repeat(2, axis=0).repeat(2, axis=1)
+        disparity = np.zeros(left.shape, np.float32)
+        disparity[: found.shape[0], : found.shape[1]] = found
         if fine_rows == 0:
             return disparity
-        part = slice(0, fine_rows + _RUN_OUT_ROWS)
+        # The matcher's blocks and paths reach beyond the last fine row.
+        part = slice(0, fine_rows + RUN_UP_ROWS // 2)
         far = self._fine.compute(left[part], right[part])[:fine_rows]
         near = disparity[:fine_rows]
         too_near = near > self._fine.num_disparities - _OVERLAP_PX

@@ -34,13 +34,9 @@ _CONTROLS = SEGMENTS + 3
 BINS_PER_PX = 2
 PITCH_SIGMA_RAD, HEIGHT_SIGMA = 0.006, 0.01
 """How far pitch and height, as a share of it, may swing about the mount, one sigma."""
-_SCALE_PX = 0.6
-"""Scale of the M-estimator."""
-_STIFFNESS = 0.02
-"""How strongly the spline resists bending."""
-_LINE = ((1.5, 1e4), (1.0, 1e4))
-_SPLINE = 2 * ((1.5, 1.0),) + 4 * ((1.0, 1.0),)
-"""Scale of the estimator and stiffness of the spline, relative to the settings, by iteration: a
+_LINE = ((2.7, 200.0), (1.8, 200.0))
+_SPLINE = 2 * ((2.7, 0.02),) + 4 * ((1.8, 0.02),)
+"""Width of Tukey's biweight in pixels, and how strongly the spline resists bending, by iteration: a
 line, near the plane that is known, then a spline, which grows along the floor where that bends."""
 _CORRELATED_PIXELS = 200.0
 """Neighbouring disparities err together: so many of them count as one measurement."""
@@ -118,14 +114,17 @@ class FloorProfile:
     disparity_px: Array
     support: float
 
+    @cached_property
+    def _nodes(self) -> tuple[Array, Array]:
+        """Rows and disparities between which the profile is straight; it goes on as the line."""
+        rows = self.first_row + np.arange(len(self.disparity_px) + 1.0)
+        rows[-1] += 1e5  # no floor is seen so far below the image
+        last_px = self.disparity_px[-1] + self.line.slope * (rows[-1] - rows[-2])
+        return rows, np.append(self.disparity_px, last_px)
+
     def at_rows(self, rows: Array | NDArray[np.integer]) -> Array:
-        """Return the floor's disparity at de-rolled rows, NaN above the first row."""
-        row = np.asarray(rows, np.float64)
-        end = self.first_row + len(self.disparity_px) - 1
-        grid = self.first_row + np.arange(len(self.disparity_px))
-        values = np.interp(row, grid, self.disparity_px)
-        values += np.maximum(row - end, 0) * self.line.slope
-        profile: Array = np.where(row < self.first_row, np.nan, values).astype(np.float64)
+        """Return the floor's disparity at de-rolled rows (…), NaN above the first row."""
+        profile: Array = np.interp(rows, *self._nodes, left=np.nan)
         return profile
 
     def at_pixels(self, derolled: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -138,13 +137,12 @@ class FloorProfile:
         share = offset - index.astype(np.float32)
         return by_row[index] * (1 - share) + by_row[index + 1] * share
 
-    def row_of_disparity(self, disparity_px: NDArray[np.floating]) -> Array:
+    def row_of_disparity(self, disparity_px: Array) -> Array:
         """Return the de-rolled row at which the floor has a disparity."""
-        d = np.asarray(disparity_px, np.float64)
-        grid = self.first_row + np.arange(len(self.disparity_px))
-        rows = np.interp(d, self.disparity_px, grid)
-        rows += np.maximum(d - self.disparity_px[-1], 0) / self.line.slope
-        return rows - np.maximum(self.disparity_px[0] - d, 0) / self.line.slope
+        rows, nodes_px = self._nodes
+        before_px = np.maximum(nodes_px[0] - disparity_px, 0)
+        row: Array = np.interp(disparity_px, nodes_px, rows) - before_px / self.line.slope
+        return row
 
 
 def spline_basis(positions: NDArray[np.floating]) -> Array:
@@ -183,10 +181,10 @@ def fit_profile(v_disparity: VDisparity, line: FloorLine, camera: StereoCamera) 
     bend = np.diff(np.eye(_CONTROLS), n=2, axis=0)
 
     def linearise(controls: Array, stage: tuple[float, float]) -> tuple[Array, Array, float]:
-        factor, stiffness = stage
-        ratio = np.clip((disparity - basis @ controls) / (3 * factor * _SCALE_PX), -1, 1)
+        width_px, stiffness = stage
+        ratio = np.clip((disparity - basis @ controls) / width_px, -1, 1)
         robust = weight * (1 - ratio**2) ** 2
-        known = information + _STIFFNESS * stiffness * bend.T @ bend
+        known = information + stiffness * bend.T @ bend
         weighted = basis.T * robust
         gradient = weighted @ (disparity - basis @ controls) + known @ (prior - controls)
         return weighted @ basis + known, gradient, float(robust.sum())
@@ -206,15 +204,10 @@ def _prior_information(prior: Array, line: FloorLine, camera: StereoCamera) -> A
 
     The pitch shifts the line, the height scales it.
     """
-    ends = np.array([0, _CONTROLS - 1])
     jacobian = np.zeros((2, _CONTROLS))
-    jacobian[0, ends[0]] = 1.0
-    jacobian[1, ends] = (-1.0, 1.0)
-    sigma = np.array(
-        [line.slope * camera.fy * PITCH_SIGMA_RAD, HEIGHT_SIGMA * float(prior[-1] - prior[0])]
-    )
-    scaled = jacobian / sigma[:, None]
-    return scaled.T @ scaled
+    jacobian[0, 0] = 1 / (line.slope * camera.fy * PITCH_SIGMA_RAD)
+    jacobian[1, [0, -1]] = np.array([-1.0, 1.0]) / (HEIGHT_SIGMA * (prior[-1] - prior[0]))
+    return jacobian.T @ jacobian
 
 
 def pixels_where(picture: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -253,17 +246,9 @@ class FloorView:
         return cls(camera, mount, line, first_row, step, columns, shear, rows[:, None] + shear)
 
     @cached_property
-    def plane_px(self) -> NDArray[np.float32]:
-        """Disparity (R, W) of a floor that does not bend."""
-        return np.float32(self.line.slope) * (self.derolled - np.float32(self.line.horizon))
-
-    def rays(self, rows: NDArray[np.number], columns: NDArray[np.integer]) -> NDArray[np.float32]:
-        """Return the rays (3, N) of pixels of the view at depth 1, in the base's axes."""
-        camera = self.camera
-        x = (self.columns[columns] - np.float32(camera.cx)) / np.float32(camera.fx)
-        y = ((rows + (self.first_row - camera.cy)) / camera.fy).astype(np.float32)
-        R = self.mount.T_base_left[:3, :3].astype(np.float32)
-        return R[:, 0:1] * x + R[:, 1:2] * y + R[:, 2:3]
+    def half(self) -> tuple[slice, slice]:
+        """Every other row and column of the image, as a part of the view."""
+        return np.s_[::STEP_PX, :: STEP_PX // self.step]
 
     def positions(
         self,
@@ -272,18 +257,24 @@ class FloorView:
         disparity_px: NDArray[np.float32],
     ) -> NDArray[np.float32]:
         """Return where pixels of known disparity (N,) are in the base's x-y plane, (2, N)."""
-        depth = np.float32(self.camera.disparity_times_depth) / disparity_px
-        offset = self.mount.T_base_left[:2, 3:4].astype(np.float32)
-        return self.rays(rows, columns)[:2] * depth + offset
+        camera, T_base_left = self.camera, self.mount.T_base_left[:2].astype(np.float32)
+        x = (self.columns[columns] - np.float32(camera.cx)) / np.float32(camera.fx)
+        y = ((rows + (self.first_row - camera.cy)) / camera.fy).astype(np.float32)
+        right, down, ahead, offset = np.split(T_base_left, 4, axis=1)
+        depth = np.float32(camera.disparity_times_depth) / disparity_px
+        return (right * x + down * y + ahead) * depth + offset
 
     def pixels_of_profile(
         self, xy_base: NDArray[np.float32], profile: FloorProfile
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.floating]]:
         """Return the view's rows and columns (N,) of positions (2, N) on the floor as it bends,
         and its disparity there (N,); negative columns where they are behind the camera.
         """
-        x, _, depth = self._in_camera(xy_base)
-        camera = self.camera
+        camera, T_base_left = self.camera, self.mount.T_base_left.astype(np.float32)
+        R, t = T_base_left[:3, :3], T_base_left[:3, 3]
+        dx, dy = xy_base[0] - t[0], xy_base[1] - t[1]
+        x, depth = (R[0, i] * dx + R[1, i] * dy - R[2, i] * t[2] for i in (0, 2))
+        depth = np.where(depth < _NEAR_M, np.float32(2 * _FAR_M), depth)  # or behind the camera
         disparity = np.float32(camera.disparity_times_depth) / depth
         u = x / depth * np.float32(camera.fx) + np.float32(camera.cx)
         steps = np.arange(0, int(disparity.max() * SUBPIXEL) + 2)
@@ -293,21 +284,6 @@ class FloorView:
         columns = np.rint(u / np.float32(self.step))
         columns[depth > _FAR_M] = -1
         return np.rint(v).astype(np.int32), columns.astype(np.int32), disparity
-
-    def _in_camera(
-        self, xy_base: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return positions (2, N) on the floor's plane in the camera's axes, very far ahead where
-        they are behind it.
-        """
-        R_base_left = self.mount.T_base_left[:3, :3].astype(np.float32)
-        t = self.mount.T_base_left[:3, 3].astype(np.float32)
-        dx, dy = xy_base[0] - t[0], xy_base[1] - t[1]
-        x, y, depth = (
-            R_base_left[0, i] * dx + R_base_left[1, i] * dy - R_base_left[2, i] * t[2]
-            for i in range(3)
-        )
-        return x, y, np.where(depth < _NEAR_M, np.float32(2 * _FAR_M), depth)
 
 
 def column_step(camera: StereoCamera) -> int:
@@ -340,24 +316,19 @@ def surface_above(
     return mean, mean_above(counted * disparity**2) / safe - mean**2, share
 
 
-def u_disparity(bins: NDArray[np.intp], num_bins: int) -> NDArray[np.intp]:
-    """Return how often each disparity bin occurs per column, (num_bins, W).
-
-    bins: (H, W) disparity bin per pixel; bin 0 is `no match` and stays 0.
+def histogram(
+    rows: NDArray[np.integer], columns: NDArray[np.integer], shape: tuple[int, int]
+) -> NDArray[np.intp]:
+    """Return how often each cell of a picture of `shape` is among rows and columns (…), which are
+    broadcast; none lies outside.
     """
-    width = bins.shape[1]
-    counts = np.bincount((bins * width + np.arange(width)).ravel(), minlength=num_bins * width)
-    counts = counts[: num_bins * width].reshape(num_bins, width)
-    counts[0] = 0
-    return counts
+    cells = np.ravel(rows * shape[1] + columns)
+    return np.bincount(cells, minlength=shape[0] * shape[1]).reshape(shape)
 
 
 def obstacle_rows(
-    disparity_px: NDArray[np.floating] | NDArray[np.integer],
-    height_m: float,
-    rows_per_m_px: float,
-    floor_rows_per_px: float,
-) -> NDArray[np.float64]:
+    disparity_px: Array, height_m: float, rows_per_m_px: float, floor_rows_per_px: float
+) -> Array:
     """Return the count at which a u-disparity cell is an obstacle, per disparity.
 
     An upright surface of `height_m` covers `height_m * rows_per_m_px * d` rows (with
@@ -367,15 +338,13 @@ def obstacle_rows(
     return np.maximum(height_m * rows_per_m_px * disparity_px, 2 * floor_rows_per_px + 2)
 
 
-def v_disparity(
-    rows: NDArray[np.intp], bins: NDArray[np.intp], shape: tuple[int, int]
-) -> NDArray[np.intp]:
-    """Return how often each disparity bin occurs per row, `shape` = (rows, bins).
-
-    rows, bins: (N,) of the pixels that count.
+def growth(disparity: NDArray[np.float32], half: int) -> NDArray[np.float32]:
+    """Return by how much disparities (R, W) grow from `half` rows above each pixel to as many below
+    it, NaN at the upper and lower end.
     """
-    index = rows * shape[1] + bins
-    return np.bincount(index, minlength=shape[0] * shape[1])[: shape[0] * shape[1]].reshape(shape)
+    grown = np.full_like(disparity, np.nan)
+    grown[half:-half] = disparity[2 * half :] - disparity[: -2 * half]
+    return grown
 
 
 def rising(disparity: NDArray[np.float32], slope: float) -> NDArray[np.bool_]:
@@ -387,9 +356,7 @@ def rising(disparity: NDArray[np.float32], slope: float) -> NDArray[np.bool_]:
     little texture, where semi-global matching prefers level steps.
     """
     half = math.ceil(SAME_PX / slope / 2)
-    rise = np.zeros_like(disparity)
-    rise[half:-half] = disparity[2 * half :] - disparity[: -2 * half]
-    return is_rise(rise / np.float32(2 * half), slope)
+    return is_rise(growth(disparity, half) / np.float32(2 * half), slope)
 
 
 def is_rise(rise: NDArray[np.floating], slope: float) -> NDArray[np.bool_]:
@@ -402,7 +369,6 @@ def filtered_v_disparity(
     disparity: NDArray[np.float32],
     textured: NDArray[np.bool_],
     num_disparities: int,
-    bins_per_px: int,
 ) -> VDisparity:
     """Return the v-disparity of what is textured and not upright."""
     camera = view.camera
@@ -413,24 +379,19 @@ def filtered_v_disparity(
     disparity = np.minimum(disparity, nearest)
     bins = (disparity + np.float32(0.5)).astype(np.intp)
     num = num_disparities + 1
-    limit = obstacle_rows(
-        np.arange(num),
-        _OBSTACLE_M,
-        camera.fy / (camera.fx * camera.baseline_m),
-        1 / view.line.slope,
-    )
-    upright = u_disparity(bins, num) > limit[:, None]
-    width = bins.shape[1]
+    rows_per_m_px = camera.fy / (camera.fx * camera.baseline_m)
+    limit = obstacle_rows(np.arange(float(num)), _OBSTACLE_M, rows_per_m_px, 1 / view.line.slope)
+    across = np.arange(bins.shape[1])
+    upright = histogram(bins, across, (num, len(across))) > limit[:, None]
+    upright[0] = False  # no match
     keep = (disparity > 0) & textured[:, ::2] & rising(disparity, view.line.slope)
-    keep &= ~upright.take(bins * width + np.arange(width))
-    at = np.flatnonzero(keep)
-    rows, columns = np.divmod(at.astype(np.int32), np.int32(width))
-    derolled = view.derolled[:, 0].take(rows) + (view.shear_px[::2] - view.shear_px[0]).take(
-        columns
-    )
+    keep &= ~upright.take(bins * len(across) + across)
+    rows, columns = pixels_where(keep)
+    fine = (disparity[keep] * np.float32(BINS_PER_PX) + np.float32(0.5)).astype(np.intp)
+    shear_px = (view.shear_px[::2] - view.shear_px[0]).take(columns)
+    derolled = view.derolled[:, 0].take(rows) + shear_px
     first = math.floor(float(view.derolled.min()))
     last = math.ceil(float(view.derolled.max()))
     rows = (derolled - np.float32(first - 0.5)).astype(np.intp)
-    fine = (disparity.take(at) * np.float32(bins_per_px) + np.float32(0.5)).astype(np.intp)
-    counts = v_disparity(rows, fine, (last - first + 1, num * bins_per_px))
-    return VDisparity(counts * (2 * view.step), first, bins_per_px)
+    counts = histogram(rows, fine, (last - first + 1, num * BINS_PER_PX))
+    return VDisparity(counts * (2 * view.step), first, BINS_PER_PX)

@@ -11,8 +11,6 @@ How far what a network calls floor can be believed: as often as geometry agreed 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +21,12 @@ from segfloor_ros.core.floor.disparity.profile import (
     STEP_PX,
     FloorProfile,
     FloorView,
+    histogram,
     pixels_where,
-    surface_above,
 )
 from segfloor_ros.core.floor.mask.painting import enlarged, with_floor, without_floor
-from segfloor_ros.core.floor.mask.pixel_evidence import EDGE_SLOPE, Comparison, below_floor
+from segfloor_ros.core.floor.mask.pixel_evidence import FrameEvidence, below_floor, last_evidence
+from segfloor_ros.core.floor.pair import EDGE_SLOPE, TEXTURE_WINDOW_PX
 
 _MIN_REGION_PX = 15
 _MIN_COLUMNS = 0.3
@@ -40,23 +39,13 @@ _MIN_SLOPE = 1.5
 """Grey levels per pixel at half resolution; weaker edges bound no region."""
 _STRONG_SLOPE = 10.0
 """Stronger edges than this are the border of something."""
-_TEXTURE_MARGIN = 7
-_HOLE_ROWS = 12
-"""As high as the window in which texture is measured."""
 _UNMATCHED_PX = 12
 """So wide a strip at the border of what is matched may be without matches."""
 
-_ROWS, _COLUMNS = 5, 7
-"""Size of the window above the contact in which the upright surface is measured."""
-_GAP_ROWS = 2
-_MIN_SHARE = 0.25
-_MAX_SPREAD_PX = 1.2
 _BEHIND = 0.6
 """The wall behind may show this share of the disparity: the ground may dip, the pitch err."""
 _EDGE_ROWS = 4
 """So near to the end of the floor is the edge at which it ends."""
-_WEAK_EDGE = 16
-"""Sobel response of the weakest edge that shows that more than one face is seen."""
 _SETTLED_ROWS = 9
 """So far above an edge, what is measured over a window does not know of it."""
 _LEAST_BLANK_ROWS = 3
@@ -67,63 +56,43 @@ measured."""
 
 
 def fill_regions(
-    view: FloorView,
-    mask: NDArray[np.uint8],
-    slope: NDArray[np.float32],
-    upright_px: NDArray[np.float32],
-    compared: Comparison,
-    textured: NDArray[np.bool_],
-    standing: NDArray[np.bool_],
-    beside: NDArray[np.bool_],
-    odd: NDArray[np.bool_],
+    frame: FrameEvidence, mask: NDArray[np.uint8], beside: NDArray[np.bool_], odd: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
     """Return the mask with NO_EVIDENCE turned to floor in regions that look alike and continue
     floor.
 
-    slope: `image_slope`; upright_px: `upright_above`. standing: (R, W), what is measured above the
-    floor. beside, odd: (R, W), where no region goes on: `beside_something`, and what does not look
-    like floor. A region is bounded by edges of the image stronger than most of the floor's own;
-    floor by evidence must be in a share of its columns. In it a pixel becomes floor below floor,
-    the next evidence up its column; or between floor on its left and right; or, if it is not blank
-    and not measured above the floor, nearer than any of its floor.
+    beside, odd: (R, W), where no region goes on: `beside_something`, and what does not look like
+    floor. A region is bounded by edges of the image stronger than most of the floor's own; floor by
+    evidence must be in a share of its columns. In it a pixel becomes floor below floor, the next
+    evidence up its column; or between floor on its left and right; or, if it is not blank and not
+    measured above the floor, nearer than any of its floor.
     """
-    part = np.s_[::STEP_PX, :: STEP_PX // view.step]
-    small = mask[part]
+    half, slope = frame.view.half, frame.pair.picture_slope
+    small = mask[half]
     floor = small == FLOOR
     if np.count_nonzero(floor) < _MIN_REGION_PX:
         return mask
     own = slope.take(np.flatnonzero(floor)[::7])
     limit = max(_MIN_SLOPE, float(np.percentile(own, 90)))
-    agreed = compared.consistent[part] & ~compared.denied[part]
+    agreed = frame.compared.consistent[half]
     alike = (small != NOT_FLOOR) & agreed & (slope < limit)
     core = cv2.erode(alike.astype(np.uint8), np.ones((3, 3), np.uint8))
     count, region = cv2.connectedComponents(core, connectivity=4)
     top = _top_of_supported(region, count, floor)
     highest = -cv2.dilate(-top[region].astype(np.float32), np.ones((3, 3), np.uint8))
-    not_blank = cv2.erode(
-        textured[part].astype(np.uint8), np.ones((_TEXTURE_MARGIN, _TEXTURE_MARGIN), np.uint8)
-    )
+    margin = np.ones(2 * (TEXTURE_WINDOW_PX // STEP_PX + 2,), np.uint8)
+    not_blank = cv2.erode(frame.pair.textured[half].astype(np.uint8), margin)
     rows = np.arange(small.shape[0], dtype=np.float32)[:, None]
     inside = (highest < small.shape[0]) & alike & (small == NO_EVIDENCE)
-    nearer = (rows >= highest) & (not_blank > 0) & ~standing[part]
-    fill = inside & (nearer | _next_to_floor(small))
-    fill &= ~(beside | odd)[part]
+    nearer = (rows >= highest) & (not_blank > 0) & ~frame.heights.standing[half]
+    left, right = last_evidence(small, 1)[1], last_evidence(small[:, ::-1], 1)[1][:, ::-1]
+    next_to_floor = left & right | below_floor(small)
+    fill = inside & (nearer | next_to_floor) & ~(beside | odd)[half]
     mask = with_floor(mask, enlarged(fill, mask))
     # Light on the floor is no border, where both ends of a stretch are known.
     no_border = agreed & (slope < _STRONG_SLOPE)
-    to_contact = fill_to_contact(view, mask, no_border, ~odd[part], upright_px, compared)
+    to_contact = fill_to_contact(frame, mask, no_border, ~odd[half])
     return with_floor(mask, enlarged(to_contact, mask))
-
-
-def image_slope(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return how grey levels change from pixel to pixel of whole image rows (R, image width) at
-    half the resolution in both directions.
-    """
-    smooth = cv2.blur(image, (5, 5))[::STEP_PX, ::STEP_PX]
-    across = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8)
-    along = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8)
-    # cv2.magnitude rounds by where its arrays lie in memory, so from run to run.
-    return np.sqrt(across * across + along * along)
 
 
 def _top_of_supported(
@@ -136,44 +105,26 @@ def _top_of_supported(
     owner = region[rows, columns]
     first = np.full(count, len(region), np.intp)
     first[owner[::-1]] = rows[::-1]  # the topmost comes last
-    is_wide = _columns_of(region, count, floor) >= _MIN_COLUMNS * _columns_of(region, count)
+    shape = count, region.shape[1]
+    counts = histogram(owner, columns, shape), histogram(region, np.arange(shape[1]), shape)
+    with_floor, wide = (np.count_nonzero(part, axis=1) for part in counts)
+    is_wide = with_floor >= _MIN_COLUMNS * wide
     is_large = np.bincount(owner, minlength=count) >= _MIN_REGION_PX
     is_large[0] = False
     return np.where(is_large & is_wide, first, len(region))
-
-
-def _columns_of(
-    region: NDArray[np.int32], count: int, where: NDArray[np.bool_] | None = None
-) -> NDArray[np.intp]:
-    """Return in how many columns each region (count,) of a picture (R, W) has pixels of `where`."""
-    width = region.shape[1]
-    cell = region * np.int32(width) + np.arange(width, dtype=np.int32)
-    cells = np.zeros(count * width, np.bool_)
-    cells[cell.ravel() if where is None else cell[where]] = True
-    return np.count_nonzero(cells.reshape(count, width), axis=1)
-
-
-def _next_to_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Tell of NO_EVIDENCE where the next evidence up the column is floor, or that to the left and
-    that to the right.
-    """
-    nothing = mask == NO_EVIDENCE
-    across = Runs.of(nothing)
-    between = across.before(mask, NO_EVIDENCE) == FLOOR
-    between &= across.after(mask, NO_EVIDENCE) == FLOOR
-    return across.painted(between) | (nothing & below_floor(mask))
 
 
 def beside_something(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Tell of what only the left camera sees, at the left border of a mask (R, W), where it does
     not lie beside floor that both cameras see: what stands there is taken to go on.
     """
-    floor_px = view.plane_px
+    floor_px = np.float32(view.line.slope) * (view.derolled - np.float32(view.line.horizon))
     first = (mask != NO_EVIDENCE).argmax(axis=1)[:, None]
     begins_with_floor = np.take_along_axis(mask, first, axis=1) == FLOOR
     begins_with_floor &= first * view.step <= floor_px[:, :1] + _UNMATCHED_PX
-    # Rows in between begin with a hole.
-    near = cv2.dilate(begins_with_floor.view(np.uint8), np.ones((_HOLE_ROWS + 1, 1), np.uint8))
+    # Rows in between begin with a hole, as high as the window in which texture is measured.
+    hole = np.ones((TEXTURE_WINDOW_PX + 2, 1), np.uint8)
+    near = cv2.dilate(begins_with_floor.view(np.uint8), hole)
     return (view.columns < floor_px) & (near == 0)
 
 
@@ -186,13 +137,21 @@ def fill_gaps(
     height, width = mask.shape
     disparity = np.nan_to_num(profile.at_rows(np.arange(height) + view.first_row))
     longest = _GAP_M * view.camera.fx / view.camera.disparity_times_depth * disparity / view.step
-    gaps = Runs.of(mask == NO_EVIDENCE)
+    # All rows in turn, each between two columns that are no floor.
+    bordered = np.pad(mask, ((0, 0), (1, 1)), constant_values=NOT_FLOOR)
+    known = np.flatnonzero(bordered != NO_EVIDENCE)
+    gaps = np.flatnonzero(np.diff(known) > 1)
+    before, behind = known[gaps], known[gaps + 1]
+    row, column = np.divmod(before, width + 2)
+    across = np.minimum(behind - before, width - column)
     # The matcher leaves out some columns at the right border.
-    at_border = (gaps.stop == width) & (width - gaps.first <= _UNMATCHED_PX // view.step)
-    between = gaps.before(mask, NO_EVIDENCE) == FLOOR
-    between &= (gaps.after(mask, NO_EVIDENCE) == FLOOR) | at_border
-    across = np.minimum(gaps.stop, width - 1) - gaps.first + 1
-    return with_floor(mask, gaps.painted(between & (across <= longest[gaps.row])) & consistent)
+    at_border = (behind - before > across) & (across <= _UNMATCHED_PX // view.step)
+    fill = (bordered.take(behind) == FLOOR) | at_border
+    fill &= (bordered.take(before) == FLOOR) & (across <= longest[row])
+    steps = np.zeros(bordered.size, np.int8)
+    steps[before[fill] + 1], steps[behind[fill]] = 1, -1
+    filled = np.cumsum(steps, dtype=np.int8).reshape(bordered.shape)[:, 1:-1] > 0
+    return with_floor(mask, filled & consistent)
 
 
 def drop_islands(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -205,16 +164,15 @@ def drop_islands(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return without_floor(mask, enlarged((area < _ISLAND_SHARE * area[1:].max())[label], mask))
 
 
-def trim_to_edges(
-    mask: NDArray[np.uint8], slope: NDArray[np.int16], reach_px: int
-) -> NDArray[np.uint8]:
+def trim_to_edges(mask: NDArray[np.uint8], slope: NDArray[np.int16]) -> NDArray[np.uint8]:
     """Return the mask (R, W) without floor that only borrowed its texture from the floor below it.
     slope: `row_slope` of the image (R, W).
 
-    Texture is measured over a window, so below a blank wall floor reaches up to `reach_px` rows
-    too high. There it is cut off at the strongest edge between the two, and where there is none,
-    where the texture is its own.
+    Texture is measured over a window, so below a blank wall floor reaches some rows too high. There
+    it is cut off at the strongest edge between the two, and where there is none, where the texture
+    is its own.
     """
+    reach_px = TEXTURE_WINDOW_PX // 2 + 3
     floor = (mask == FLOOR).astype(np.uint8)
     nothing = (mask == NO_EVIDENCE).astype(np.uint8)
     upward = np.ones((reach_px + 1, 1), np.uint8)
@@ -225,77 +183,53 @@ def trim_to_edges(
     strongest = cv2.dilate(slope, np.ones((2 * reach_px + 1, 1), np.uint8))
     edge = ((slope == strongest) & (slope >= EDGE_SLOPE)).astype(np.uint8)
     under_edge = cv2.dilate(edge, upward, anchor=(0, reach_px))
-    trimmed = mask.copy()
-    trimmed[(below_blank > 0) & (under_edge == 0)] = NO_EVIDENCE
-    return trimmed
+    return without_floor(mask, (below_blank > 0) & (under_edge == 0))
 
 
 def fill_to_contact(
-    view: FloorView,
+    frame: FrameEvidence,
     mask: NDArray[np.uint8],
     alike: NDArray[np.bool_],
     may_begin: NDArray[np.bool_],
-    upright_px: NDArray[np.float32],
-    compared: Comparison,
 ) -> NDArray[np.bool_]:
     """Return where plain floor goes on up to the foot of something upright.
 
-    mask: (R, W). alike, may_begin, upright_px (`upright_above`): where nothing borders, what most
-    of a stretch must be if no floor is seen nearer, and what stands, at half the resolution in both
-    directions of the image, the shape of the result.
+    mask: (R, W). alike, may_begin: where nothing borders, and what most of a stretch must be if no
+    floor is seen nearer, at half the resolution in both directions of the image, the shape of the
+    result.
     """
-    part = np.s_[::STEP_PX, :: STEP_PX // view.step]
-    small = mask[part]
+    small = mask[frame.view.half]
     open_ = alike & (small == NO_EVIDENCE)
     if not open_.any():
         return open_
-    floor_px = compared.floor_px
+    upright_px, floor_px = frame.upright_px, frame.compared.floor_px
     nearest, farthest = floor_px + np.float32(SAME_PX), np.float32(_BEHIND) * floor_px
     contact = (upright_px < nearest) & (upright_px > farthest - np.float32(SAME_PX))
-    rows = np.arange(small.shape[0], dtype=np.int32)[:, None]
-    above = np.maximum.accumulate(np.where(open_, 0, rows), axis=0)
-    last = small.shape[0] - 1
-    below = np.minimum.accumulate(np.where(open_, last, rows)[::-1], axis=0)[::-1]
-    starts = np.take_along_axis(small, below, axis=0) == FLOOR
-    cut_off = open_ & open_[last] & (below == last)
+    bounds = np.where(open_, np.uint8(NO_EVIDENCE), np.where(small == FLOOR, small, NOT_FLOOR))
+    above = np.maximum(last_evidence(bounds)[0], 0)
+    below, starts = (part[::-1] for part in last_evidence(bounds[::-1]))
+    cut_off = open_ & (below < 0)
     columns = 2 * (cut_off & may_begin).sum(axis=0) > cut_off.sum(axis=0)
     return open_ & (starts | (cut_off & columns)) & np.take_along_axis(contact, above, axis=0)
 
 
-def upright_above(
-    view: FloorView,
-    disparity: NDArray[np.float32],
-    compared: Comparison,
-    textured: NDArray[np.bool_],
-) -> NDArray[np.float32]:
-    """Return the disparity of the upright surface right above each pixel, NaN where none is, at
-    half the resolution in both directions of the image. disparity, textured: (R, W); where nothing
-    has texture, disparities are of noise.
-    """
-    part = np.s_[::STEP_PX, :: STEP_PX // view.step]
-    contrary = ~compared.consistent[part] | compared.denied[part]
-    counted = (contrary & textured[part] & (disparity[part] > 0)).astype(np.float32)
-    average, variance, share = surface_above(disparity[part], counted, (_COLUMNS, _ROWS), _GAP_ROWS)
-    good = (share >= _MIN_SHARE) & (variance < _MAX_SPREAD_PX**2)
-    return np.where(good, average, np.float32(np.nan))
-
-
 def blank_feet(
-    view: FloorView, mask: NDArray[np.uint8], slope: NDArray[np.int16], textured: NDArray[np.bool_]
+    frame: FrameEvidence, mask: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     """Return rows and columns (N,) of the view where blank faces stand on the floor of a mask
-    (R, W). slope: `row_slope` of the image (R, W).
+    (R, W).
 
     Such a face shows nothing but where it begins: up a column the floor ends at an edge of the
     image, and from there to the horizon there is no texture, and no other edge. Beyond a shadow or
     a blank patch the floor goes on, and ends at another edge.
     """
     height, width = mask.shape
-    columns = np.arange(width)
+    view, slope, columns = frame.view, frame.pair.slope, np.arange(width)
     top = (mask == FLOOR).argmax(axis=0)
     near = np.clip(top + np.arange(-_EDGE_ROWS, _EDGE_ROWS + 1)[:, None], 1, height - 2)
     edge = np.take_along_axis(near, slope[near, columns].argmax(axis=0)[None], axis=0)[0]
-    seen = (textured | (slope >= _WEAK_EDGE)).cumsum(axis=0, dtype=np.int16)
+    # Weaker edges, too, show that more than one face is seen.
+    seen = (frame.pair.textured | (slope >= EDGE_SLOPE * 2 // 3)).cumsum(axis=0, dtype=np.int16)
     horizon = np.clip(np.rint(view.line.horizon - view.shear_px - view.first_row), 0, height - 1)
     end = edge - _SETTLED_ROWS
     begin = horizon.astype(np.intp)
@@ -306,50 +240,6 @@ def blank_feet(
     before, at, after = (slope[rows + i, found].astype(np.float32) for i in (-1, 0, 1))
     bend = np.maximum(2 * at - before - after, 1)
     return rows + np.clip((after - before) / (2 * bend), -0.5, 0.5), found
-
-
-@dataclass(frozen=True)
-class Runs:
-    """The stretches of a picture of `shape` (R, W): row, first column and the column after the
-    last one, each (N,) intp, in the order of the pixels.
-    """
-
-    shape: tuple[int, int]
-    row: NDArray[np.intp]
-    first: NDArray[np.intp]
-    stop: NDArray[np.intp]
-
-    @classmethod
-    def of(cls, picture: NDArray[np.bool_]) -> Runs:
-        """Return the stretches of a picture (R, W) bool."""
-        height, width = picture.shape
-        padded = np.zeros(height * (width + 1) + 1, np.bool_)
-        padded[:-1].reshape(height, width + 1)[:, 1:] = picture
-        edges = np.flatnonzero(padded[1:] != padded[:-1]) + 1
-        row, first = np.divmod(edges[::2], width + 1)
-        first -= 1
-        return cls((height, width), row, first, first + edges[1::2] - edges[::2])
-
-    def before(self, values: NDArray[np.uint8], outside: int) -> NDArray[np.uint8]:
-        """Return the values (R, W) of the pixels right before the stretches, (N,)."""
-        found = values[self.row, np.maximum(self.first - 1, 0)]
-        return np.where(self.first > 0, found, np.uint8(outside))
-
-    def after(self, values: NDArray[np.uint8], outside: int) -> NDArray[np.uint8]:
-        """Return the values (R, W) of the pixels right after the stretches, (N,)."""
-        last = self.shape[1] - 1
-        found = values[self.row, np.minimum(self.stop, last)]
-        return np.where(self.stop <= last, found, np.uint8(outside))
-
-    def painted(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return the picture (R, W) of the chosen ones (N,) of the stretches."""
-        height, width = self.shape
-        start = self.row[chosen] * width + self.first[chosen]
-        length = self.stop[chosen] - self.first[chosen]
-        edges = np.zeros(2 * len(start) + 2, np.intp)
-        edges[1:-1:2], edges[2:-1:2], edges[-1] = start, start + length, height * width
-        inside = np.arange(len(edges) - 1) % 2 == 1
-        return np.repeat(inside, np.diff(edges)).reshape(height, width)
 
 
 class NetworkFloor:

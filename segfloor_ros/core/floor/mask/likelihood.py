@@ -21,8 +21,14 @@ from numpy.typing import NDArray
 from segfloor_ros.core.floor.disparity.matching import NOISE_PX, NOISE_SLOPE, SAME_PX, SIGMAS
 from segfloor_ros.core.floor.disparity.profile import STEP_PX
 from segfloor_ros.core.floor.mask.look import sigmas_off_floor
-from segfloor_ros.core.floor.mask.painting import enlarged, with_floor, without_floor
-from segfloor_ros.core.floor.mask.pixel_evidence import LEAST_FLOOR_PX, Costs
+from segfloor_ros.core.floor.mask.painting import (
+    LEAST_KNOWN,
+    enlarged,
+    mean_of_known,
+    with_floor,
+    without_floor,
+)
+from segfloor_ros.core.floor.mask.pixel_evidence import LEAST_FLOOR_PX
 from segfloor_ros.core.geometry import Array
 
 Picture = NDArray[np.float32]
@@ -45,8 +51,6 @@ off. matched: log ratio of the difference of both images on the floor to that at
 disparity. look: log ratio of how likely its brightness is of the floor to how often it is seen.
 """
 
-_IN_ORDER = tuple(WEIGHTS.values())
-
 _SURE, _UNLIKELY = (math.log(p / (1 - p)) for p in (0.95, 1 / 3))
 """Log odds: what is more likely floor than the first is floor, what is less likely than the second
 is none."""
@@ -55,10 +59,6 @@ _LOCAL, _ROUNDS = (31, 15), 3
 """Columns and rows of the window in which the floor around a pixel is measured, and how often."""
 _NOTHING = 0.02
 """So small a share of a window tells nothing."""
-LEAST_KNOWN = 0.2
-"""What is known less well than this share says nothing."""
-_LEAST_PIXELS = 100
-"""Fewer do not tell how they spread."""
 _NEAR, _WIDE = (5, 5), (9, 9)
 """Columns and rows of the windows over which pixels are averaged, and are counted."""
 _MOST_SIGMAS, _MOST_NATS = 12.0, 6.0
@@ -67,9 +67,6 @@ _UNEVEN = 0.7, 2.8
 """How uneven floors are, in sigmas of a disparity, at least and at most."""
 _RISE_SIGMA_PX = 0.7, 2.0
 """Error of the difference of two disparities, at least and at most."""
-_UNEQUAL_GREY = 0.8, 0.3
-"""Mean difference of both images of the same thing: so many sigmas of noise, and grey levels."""
-
 _BINS, _END = 2, 10
 """Of the histogram of brightness, per sigma of the floor's; it ends at so many sigmas."""
 _LOOK_NATS = -4.0, 3.0
@@ -80,29 +77,35 @@ _LOOK_NATS = -4.0, 3.0
 class Seen:
     """What is known of each pixel.
 
-    first_row: of the image. floor_px, disparity_px: disparity of the floor, and the matched one, 0
-    where none is. slope: of a floor's disparity, per row of the image. texture: as many times of
-    what is surely no noise. lower: bool, what lies deeper than a robot may drop. grey: brightness,
-    smoothed. costs: None of a depth camera. noise_grey: of the images. is_floor: bool, what is
-    floor so far.
+    floor_px, disparity_px: disparity of the floor, and the matched one, 0 where none is. slope: of
+    a floor's disparity, per row of the image. texture: as many times of what is surely no noise.
+    lower: bool, what lies deeper than a robot may drop. grey: brightness, smoothed. better: log
+    ratio of how much the images differ on the floor to how much they do as matched. noise_grey: of
+    the images, 0 of depth that is measured. is_floor: bool, what is floor so far.
     """
 
-    first_row: int
     floor_px: Picture
     disparity_px: Picture
     slope: float
     texture: Picture
     lower: NDArray[np.bool_]
     grey: Picture
-    costs: Costs | None
+    better: Picture
     noise_grey: float
     is_floor: NDArray[np.bool_]
 
 
 def known_weight(seen: Seen) -> Picture:
-    """Return how well the disparity of each pixel is known (h, w), in [0, 1]."""
-    weight: Picture = np.clip(2 * seen.texture - 1, 0, 1) * _certainty(seen)
-    return weight * (seen.disparity_px > 0)
+    """Return how well the disparity of each pixel is known (h, w), in [0, 1], 1 where as well as it
+    can be: the bound of Cramer and Rao of what the block around a pixel shows.
+    """
+    weight: Picture = np.clip(2 * seen.texture - 1, 0, 1) * (seen.disparity_px > 0)
+    slope = cv2.Sobel(seen.grey, cv2.CV_32F, 1, 0, ksize=1, scale=1 / (2 * STEP_PX))
+    pixels = _NEAR[0] * _NEAR[1]
+    power = cv2.boxFilter(slope * slope, -1, _NEAR, normalize=False)
+    power -= np.float32(pixels * NOISE_SLOPE * seen.noise_grey**2)
+    variance = np.float32(2 * seen.noise_grey**2) / np.maximum(power, np.float32(1e-3))
+    return weight * (np.float32(NOISE_PX) / np.sqrt(np.float32(NOISE_PX**2) + variance))
 
 
 def features(seen: Seen, weight: Picture) -> Picture:
@@ -118,38 +121,16 @@ def features(seen: Seen, weight: Picture) -> Picture:
     rises *= np.where(rises > 0, np.exp(-(height**2) / 8), is_higher)
     positive = (np.maximum(values, 0) for values in (height, rises, -rises, mostly_on))
     look = _look(seen.grey, seen.is_floor)
-    return np.stack([one, *positive, _matched_better(seen, known), look])
+    return np.stack([one, *positive, seen.better * known, look])
 
 
 def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, float]) -> np.float32:
     """Return the standard deviation of some values by their median, within bounds; the least where
-    they are few.
+    there are none.
     """
     some = values[where]
-    spread = 1.4826 * float(np.median(np.abs(some))) if len(some) > _LEAST_PIXELS else 0.0
+    spread = 1.4826 * float(np.median(np.abs(some))) if len(some) else 0.0
     return np.float32(np.clip(spread, *bounds))
-
-
-def _mean(values: Picture, known: Picture, size: tuple[int, int]) -> Picture:
-    """Return the sum of values around each pixel over how much is known there."""
-    share = cv2.blur(known, size)
-    mean: Picture = cv2.blur(values, size) / np.maximum(share, np.float32(LEAST_KNOWN))
-    return mean
-
-
-def _certainty(seen: Seen) -> Picture | np.float32:
-    """Return how well disparities are known, 1 where as well as they can be: the bound of Cramer
-    and Rao of what the block around a pixel shows.
-    """
-    if seen.costs is None:
-        return np.float32(1)
-    slope = cv2.Sobel(seen.grey, cv2.CV_32F, 1, 0, ksize=1, scale=1 / (2 * STEP_PX))
-    pixels = _NEAR[0] * _NEAR[1]
-    power = cv2.boxFilter(slope * slope, -1, _NEAR, normalize=False)
-    power -= np.float32(pixels * NOISE_SLOPE * seen.noise_grey**2)
-    variance = np.float32(2 * seen.noise_grey**2) / np.maximum(power, np.float32(1e-3))
-    certainty: Picture = np.float32(NOISE_PX) / np.sqrt(np.float32(NOISE_PX**2) + variance)
-    return certainty
 
 
 def _local_height(seen: Seen, weight: Picture, known: Picture) -> tuple[Picture, Picture]:
@@ -166,12 +147,13 @@ def _local_height(seen: Seen, weight: Picture, known: Picture) -> tuple[Picture,
         on = weight * ((gap < SIGMAS * 1.5) & (gap > lowest))
         floor = cv2.blur(on * above, _LOCAL) / (cv2.blur(on, _LOCAL) + np.float32(_NOTHING))
         lowest = -SIGMAS * 1.5
-    smooth = _mean(above, known, _NEAR) - floor
+    smooth = mean_of_known(above, known, _NEAR)[0] - floor
     even = (weight > LEAST_KNOWN) & (np.abs(smooth) < 3 * SIGMAS)
     height = (above - floor) / _spread(smooth, even, _UNEVEN)
     bounded = np.clip(height, -_MOST_SIGMAS, _MOST_SIGMAS) * weight
     on_off = np.where(np.abs(height) < SIGMAS, weight, -weight)
-    return _mean(bounded, known, _NEAR) * known, _mean(on_off, known, _WIDE)
+    near, wide = mean_of_known(bounded, known, _NEAR)[0], mean_of_known(on_off, known, _WIDE)[0]
+    return near * known, wide
 
 
 def _rise(seen: Seen, weight: Picture, known: Picture) -> Picture:
@@ -191,20 +173,7 @@ def _rise(seen: Seen, weight: Picture, known: Picture) -> Picture:
     ratio = np.zeros_like(known)
     nats = of_floor * (2 * rise - of_floor) / (2 * sigma**2)
     ratio[rows:-rows] = np.clip(nats, -_MOST_NATS, _MOST_NATS) * both
-    return _mean(ratio, known, _NEAR)
-
-
-def _matched_better(seen: Seen, known: Picture) -> Picture:
-    """Return the log ratio of how much the images differ on the floor to how much they do at the
-    matched disparity; 0 where they say nothing.
-    """
-    if seen.costs is None:
-        return np.zeros_like(known)
-    costs, (sigmas, grey) = seen.costs, _UNEQUAL_GREY
-    noise = np.float32(sigmas * seen.noise_grey + grey)
-    best = np.minimum(costs.matched, costs.floor)
-    ratio: Picture = np.log((costs.floor + noise) / (best + noise)) * known * costs.reached
-    return ratio
+    return mean_of_known(ratio, known, _NEAR)[0]
 
 
 def _look(grey: Picture, is_floor: NDArray[np.bool_]) -> Picture:
@@ -222,10 +191,12 @@ def _look(grey: Picture, is_floor: NDArray[np.bool_]) -> Picture:
 
 
 class Likelihood:
-    """Finds how likely the pixels of a frame are floor. weights: of the features, (F,)."""
+    """Finds how likely the pixels of a frame are floor. weights: of the features, (F,); `WEIGHTS`
+    where none are given."""
 
-    def __init__(self, weights: Sequence[float] | Array = _IN_ORDER) -> None:
-        self.weights = np.array(weights, np.float32)
+    def __init__(self, weights: Sequence[float] | Array | None = None) -> None:
+        chosen = list(WEIGHTS.values()) if weights is None else weights
+        self.weights = np.array(chosen, np.float32)
 
     def weighed(self, mask: NDArray[np.uint8], seen: Seen) -> NDArray[np.uint8]:
         """Return a mask (R, W) without floor that is not likely, and with what surely is floor,

@@ -6,14 +6,14 @@ The floor is tested on the images themselves, too. Semi-global matching prefers 
 the camera and, where texture is weak, agrees with whatever repeats: the blocks of a compressed
 image, its neighbours. Here the right image is drawn as it would look were everything floor, and
 compared with the left one. What then agrees about as well as it does with the matched disparities
-cannot be said not to be floor. Texture, beyond the noise of the image, says where a disparity means
-something.
+cannot be said not to be floor.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -28,8 +28,22 @@ from segfloor_ros.core.floor.disparity.matching import (
     SAME_PX,
     SIGMAS,
 )
-from segfloor_ros.core.floor.disparity.profile import STEP_PX, FloorLine, FloorProfile, FloorView
-from segfloor_ros.core.floor.mask.painting import enlarged
+from segfloor_ros.core.floor.disparity.profile import (
+    STEP_PX,
+    FloorProfile,
+    FloorView,
+    growth,
+    histogram,
+    pixels_where,
+    surface_above,
+)
+from segfloor_ros.core.floor.mask.painting import (
+    LEAST_KNOWN,
+    enlarged,
+    mean_of_known,
+    without_floor,
+)
+from segfloor_ros.core.floor.pair import Pair
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
 LEAST_FLOOR_PX = 2.5
@@ -41,7 +55,6 @@ _CONTACT_HEIGHT_M = 0.12
 _NEIGHBOURS_PX = 9
 """Heights are averaged over so wide a square; ones that are matched err together."""
 _MOST_SIGMAS = np.float32(10)
-_LEAST_KNOWN = 0.2
 
 _AGAINST_GREY = 1.0
 """By how much the images must contradict the floor to deny it, beyond their noise."""
@@ -58,26 +71,14 @@ _MARGIN_PX = 4.0
 _NOISE_SHARE = 2.0
 """Two images of the same thing differ by 1.13 sigma of noise on average, and by interpolation."""
 
-_SIGMA_PX = 2.0
-_MIN_TEXTURE_GREY = 0.2
-"""Below this slope of the image along a row, per pixel, a disparity says nothing."""
-_NOISE_TEXTURE = 0.1
-"""Texture per grey level of noise that is surely no noise: its own is 0.04."""
-TEXTURE_WINDOW_PX = 11
-"""Over so wide a square texture is measured."""
-EDGE_SLOPE = 24
-"""Sobel response of the weakest edge that counts: 3 grey levels per row."""
+_UNEQUAL_GREY = 0.8, 0.3
+"""Mean difference of both images of the same thing: so many sigmas of noise, and grey levels."""
 
-
-@dataclass(frozen=True)
-class Costs:
-    """How much both images differ around each pixel, grey levels: were it floor, and as matched,
-    (R / 2, W'). reached: 1 where the right camera sees the floor, else 0.
-    """
-
-    floor: NDArray[np.float32]
-    matched: NDArray[np.float32]
-    reached: NDArray[np.float32]
+_UPRIGHT_WINDOW = 7, 5
+"""Columns and rows of the window above the contact in which the upright surface is measured."""
+_GAP_ROWS = 2
+_MIN_SHARE = 0.25
+_MAX_SPREAD_PX = 1.2
 
 
 @dataclass(frozen=True)
@@ -86,8 +87,9 @@ class Comparison:
 
     floor_px: (R / 2, W') float32, the floor's disparity at half the resolution of the image.
     against: clearly more like the matched disparity than like floor. denied: the same of the
-    surroundings taken together. unlike: unlike floor, whatever it is. consistent: may be floor.
-    costs: None of a depth camera.
+    surroundings taken together. unlike: unlike floor, whatever it is. consistent: may be floor, not
+    denied.
+    better: float32 as floor_px, `matched_better`.
     """
 
     floor_px: NDArray[np.float32]
@@ -95,122 +97,128 @@ class Comparison:
     denied: NDArray[np.bool_]
     unlike: NDArray[np.bool_]
     consistent: NDArray[np.bool_]
-    costs: Costs | None = None
-
-
-@dataclass(frozen=True)
-class HeightTable:
-    """Per disparity step: row: the de-rolled row of the floor. Height above the floor is
-    `offset - scale * derolled row`, in metres; up, down: how much of it is still floor; noise: its
-    error, one sigma. All (B,) float32, NaN at disparity 0.
-    """
-
-    row: NDArray[np.float32]
-    offset: NDArray[np.float32]
-    scale: NDArray[np.float32]
-    up: NDArray[np.float32]
-    down: NDArray[np.float32]
-    noise: NDArray[np.float32]
-
-    @classmethod
-    def of(
-        cls,
-        line: FloorLine,
-        profile: FloorProfile,
-        num_disparities: int,
-        settings: FloorSegmentationSettings,
-        measured: float | None = None,
-    ) -> HeightTable:
-        """Return the table of a profile. measured: disparity times depth of a depth camera."""
-        disparity = np.arange(num_disparities * SUBPIXEL + 1) / SUBPIXEL
-        disparity[0] = np.nan
-        scale = line.metres_per_row / disparity
-        noise_px = NOISE_PX if measured is None else measured_sigma_px(measured, disparity)
-        # One pixel of disparity is this much height: the camera's height over the disparity.
-        noise_m = noise_px * line.metres_per_row / line.slope / disparity
-        row = profile.row_of_disparity(disparity)
-        tables = (
-            row,
-            scale * row,
-            scale,
-            np.hypot(settings.step_height_m, noise_m),
-            settings.drop_height_m + SIGMAS * noise_m,
-            noise_m,
-        )
-        return cls(*(table.astype(np.float32) for table in tables))
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """mask: (R, W) uint8. Others, (R, W) bool: above: what is matched above the floor; off,
-    standing: what is matched off it in the mean of its neighbours, farther than their noise
-    explains, and above it, farther than that of a single one; odd: what does not look like floor.
-    """
-
-    mask: NDArray[np.uint8]
-    above: NDArray[np.bool_]
-    off: NDArray[np.bool_]
-    standing: NDArray[np.bool_]
-    odd: NDArray[np.bool_]
+    better: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Heights:
-    """What disparities say of how high pixels lie, (R, W). table, index: their disparity step in
-    it. height: float32 in metres. above, off: bool, higher than floor can be, or lower, too.
+    """What disparities say of how high pixels lie, (R, W).
+
+    height, noise: above the floor, float32 in metres, and its error, one sigma. floor_row: the
+    de-rolled row of the floor of the same disparity. above, off: bool, higher than floor can be, or
+    lower, too; near: no higher than what is upright and stands on the floor right below.
     """
 
-    table: HeightTable
-    index: NDArray[np.int32]
     height: NDArray[np.float32]
+    noise: NDArray[np.float32]
+    floor_row: NDArray[np.float32]
     above: NDArray[np.bool_]
     off: NDArray[np.bool_]
+    near: NDArray[np.bool_]
+
+    @cached_property
+    def mean_sigmas(self) -> NDArray[np.float32]:
+        """Height of each pixel (R, W) in the mean of its neighbours, in sigmas of one of them; NaN
+        where that is not known.
+        """
+        return _mean_of_neighbours(self.height / self.noise)
+
+    @cached_property
+    def mean_off(self) -> NDArray[np.bool_]:
+        """What in the mean of its neighbours lies off the floor (R, W), by more than their noise
+        explains.
+        """
+        return np.abs(self.mean_sigmas) > SIGMAS * MEAN_NOISE
+
+    @cached_property
+    def standing(self) -> NDArray[np.bool_]:
+        """What in the mean of its neighbours lies above the floor, (R, W)."""
+        return self.mean_sigmas > SIGMAS
 
     @classmethod
-    def of(cls, view: FloorView, table: HeightTable, disparity: NDArray[np.float32]) -> Heights:
-        """Return the heights of the pixels of a view, of known disparities (R, W)."""
+    def of(
+        cls,
+        view: FloorView,
+        profile: FloorProfile,
+        pair: Pair,
+        disparity: NDArray[np.float32],
+        num_disparities: int,
+        settings: FloorSegmentationSettings,
+    ) -> Heights:
+        """Return the heights of the pixels of a view, of known disparities (R, W), by a table of as
+        many as are searched.
+        """
+        line, steps = view.line, np.arange(num_disparities * SUBPIXEL + 1) / SUBPIXEL
+        steps[0] = np.nan
+        scale = line.metres_per_row / steps
+        constant, is_matched = view.camera.disparity_times_depth, pair.measured is None
+        noise_px = NOISE_PX if is_matched else measured_sigma_px(constant, steps)
+        # One pixel of disparity is this much height: the camera's height over the disparity.
+        noise = noise_px * line.metres_per_row / line.slope / steps
+        row = profile.row_of_disparity(steps)
+        up = np.hypot(settings.step_height_m, noise)
+        down = settings.drop_height_m + SIGMAS * noise
         # What is nearer than the table goes is no lower than what is as near as that.
-        last = np.float32(len(table.row) - 1)
+        last = np.float32(len(steps) - 1)
         index = np.minimum(disparity * np.float32(SUBPIXEL), last).astype(np.int32)
-        height = table.offset.take(index) - table.scale.take(index) * view.derolled
-        above = height > table.up.take(index)
-        return cls(table, index, height, above, above | (height < -table.down.take(index)))
+        tables = row, scale * row, scale, noise, up, down
+        row, at_row_0, scale, noise, up, down = (
+            table.astype(np.float32).take(index) for table in tables
+        )
+        height = at_row_0 - scale * view.derolled
+        above, near = height > up, height < up + np.float32(_CONTACT_HEIGHT_M)
+        return cls(height, noise, row, above, above | (height < -down), near)
 
 
-def judge(
-    view: FloorView,
-    disparity: NDArray[np.float32],
-    textured: NDArray[np.bool_],
-    compared: Comparison,
-    heights: Heights,
-    step_m: float,
-) -> NDArray[np.uint8]:
-    """Return what the pixels (R, W) of the view say by themselves, the mask of `Evidence`.
+@dataclass(frozen=True)
+class FrameEvidence:
+    """What is known of the pixels of a frame. disparity_px: (R, W), 0 where there is none."""
 
-    textured: where a disparity means something; compared: what the images say of the floor. A
-    disparity makes floor only where the images agree, and denies it only where they do. step_m:
-    what a robot climbs.
+    view: FloorView
+    profile: FloorProfile
+    pair: Pair
+    disparity_px: NDArray[np.float32]
+    heights: Heights
+    compared: Comparison
+
+    @cached_property
+    def upright_px(self) -> NDArray[np.float32]:
+        """Disparity of the upright surface right above each pixel, NaN where none is, at half the
+        resolution in both directions of the image. Where nothing has texture, disparities are of
+        noise.
+        """
+        half = self.view.half
+        disparity, textured = self.disparity_px[half], self.pair.textured[half]
+        counted = ~self.compared.consistent[half] & textured & (disparity > 0)
+        surface = disparity, counted.astype(np.float32), _UPRIGHT_WINDOW, _GAP_ROWS
+        average, variance, share = surface_above(*surface)
+        good = (share >= _MIN_SHARE) & (variance < _MAX_SPREAD_PX**2)
+        return np.where(good, average, np.float32(np.nan))
+
+
+def judge(frame: FrameEvidence, step_m: float) -> NDArray[np.uint8]:
+    """Return a mask (R, W) of what the pixels of a frame say by themselves. step_m: what a robot
+    climbs.
+
+    A disparity makes floor only where the images agree, and denies it only where they do.
     """
-    table, above, off = heights.table, heights.above, heights.off
+    view, compared, heights = frame.view, frame.compared, frame.heights
+    above, off, textured = heights.above, heights.off, frame.pair.textured
     # What seems to lie below the floor may be what the floor mirrors.
     sure = (textured & compared.against) | (compared.denied & above)
-    near = disparity >= np.float32(LEAST_FLOOR_PX)
-    may_be = textured & near & ~off
-    mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
+    measured = textured & (frame.disparity_px >= np.float32(LEAST_FLOOR_PX))
+    may_be = measured & ~off
+    mask = np.full(off.shape, NO_EVIDENCE, np.uint8)
     mask[may_be & ~(compared.against | compared.unlike)] = FLOOR
     mask[above & sure] = NOT_FLOOR
-    up = table.up.take(heights.index)
-    low = above & sure & (heights.height < up + np.float32(_CONTACT_HEIGHT_M))
-    mask[_below_contact(view, table.row, heights.index, low)] = NOT_FLOOR
+    mask[_below_contact(view, heights.floor_row, above & sure & heights.near)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
     # On a sill the images contradict the floor, and show that it is a sill; beyond it floor goes on
     # where above a foot there is what stands on it.
     sill = compared.against & (np.abs(heights.height) <= np.float32(step_m))
     mask[may_be & sill & below_floor(mask)] = FLOOR
-    mask[
-        (mask == FLOOR) & ~most_around(mask == FLOOR, textured & near & (off | (mask == FLOOR)))
-    ] = NO_EVIDENCE
-    return mask
+    floor = mask == FLOOR
+    return without_floor(mask, ~most_around(floor, measured & (off | floor)))
 
 
 def most_around(said: NDArray[np.bool_], measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -222,19 +230,22 @@ def most_around(said: NDArray[np.bool_], measured: NDArray[np.bool_]) -> NDArray
     return np.asarray(of_said >= np.float32(0.5) * of_all)
 
 
+def last_evidence(
+    mask: NDArray[np.uint8], axis: int = 0
+) -> tuple[NDArray[np.int16], NDArray[np.bool_]]:
+    """Return of each pixel of a mask (R, W) where along an axis the last evidence up to it is, -1
+    where there is none, and whether that is floor.
+    """
+    twice = np.arange(2, 2 * mask.shape[axis] + 2, 2, dtype=np.int16)
+    evidence = (twice if axis else twice[:, None]) * (mask != NO_EVIDENCE)  # odd where it is floor
+    evidence |= mask == FLOOR
+    np.maximum.accumulate(evidence, axis=axis, out=evidence)
+    return (evidence >> 1) - 1, evidence & 1 > 0
+
+
 def below_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Tell of each pixel of a mask (R, W) whether the next evidence up its column is floor."""
-    twice_row = np.arange(0, 2 * len(mask), 2, dtype=np.int16)[:, None]
-    evidence = twice_row * (mask != NO_EVIDENCE)  # odd where it is floor
-    evidence |= mask == FLOOR
-    return np.maximum.accumulate(evidence, axis=0, out=evidence) & 1 > 0
-
-
-def mean_height(heights: Heights) -> NDArray[np.float32]:
-    """Return the height above the floor of each pixel (R, W) in the mean of its neighbours, in
-    sigmas of one of them; NaN where that is not known.
-    """
-    return _mean_of_neighbours(heights.height / heights.table.noise.take(heights.index))
+    return last_evidence(mask)[1]
 
 
 def lies_on_floor(
@@ -246,12 +257,9 @@ def lies_on_floor(
     They are compared with so far above and below that floor differs by more than noise.
     """
     half = min(math.ceil(SAME_PX / view.line.slope), len(disparity) // 2)
-    rise = np.full_like(disparity, np.nan)
-    above, below = disparity[: -2 * half], disparity[2 * half :]
-    expected = np.float32(2 * half * view.line.slope)
-    rise[half:-half] = np.where((above > 0) & (below > 0), below - above - expected, np.nan)
-    noise_px = math.sqrt(2) * NOISE_PX
-    mean = _mean_of_neighbours(rise / np.float32(noise_px))
+    known_px = np.where(disparity > 0, disparity, np.float32(np.nan))
+    steeper_px = growth(known_px, half) - np.float32(2 * half * view.line.slope)
+    mean = _mean_of_neighbours(steeper_px / np.float32(math.sqrt(2) * NOISE_PX))
     return (disparity > 0) & ~heights.off & (np.abs(mean) < SIGMAS * MEAN_NOISE)
 
 
@@ -261,68 +269,60 @@ def _mean_of_neighbours(sigmas: NDArray[np.float32]) -> NDArray[np.float32]:
     """
     window = (_NEIGHBOURS_PX, _NEIGHBOURS_PX)
     known = np.isfinite(sigmas)
-    share = cv2.blur(known.astype(np.float32), window)
     bounded = np.clip(np.where(known, sigmas, np.float32(0)), -_MOST_SIGMAS, _MOST_SIGMAS)
-    mean = cv2.blur(bounded, window) / np.maximum(share, np.float32(_LEAST_KNOWN))
-    return np.where(share > _LEAST_KNOWN, mean, np.float32(np.nan))
+    mean, share = mean_of_known(bounded, known.astype(np.float32), window)
+    return np.where(share > LEAST_KNOWN, mean, np.float32(np.nan))
 
 
 def _below_contact(
-    view: FloorView,
-    floor_row: NDArray[np.float32],
-    index: NDArray[np.int32],
-    low: NDArray[np.bool_],
+    view: FloorView, floor_row: NDArray[np.float32], low: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Return the pixels between the foot of an upright surface and where it meets the floor.
 
     They are lower than a step but belong to the same surface: its disparity says at which row
-    the floor is. floor_row: by disparity step. index: (R, W) disparity steps.
+    the floor is. floor_row: as of `Heights`.
     """
     height, width = low.shape
-    at = np.flatnonzero(low)
-    foot = floor_row.take(index.reshape(-1).take(at))
-    rows, columns = np.divmod(at.astype(np.int32), np.int32(width))
-    foot -= view.shear_px.take(columns) + np.float32(view.first_row)
+    rows, columns = pixels_where(low)
+    foot = floor_row[low] - (view.shear_px.take(columns) + np.float32(view.first_row))
     end = np.clip(foot.astype(np.int32), rows, height - 1) + 1
-    size = (height + 1) * width
     covered = np.zeros((height + 1, width), np.int16)
     covered[:height] = low
-    ends = np.bincount(end * np.int32(width) + columns, minlength=size)
-    covered -= ends.reshape(-1, width).astype(np.int16)
+    covered -= histogram(end, columns, covered.shape).astype(np.int16)
     return np.cumsum(covered, axis=0, dtype=np.int16)[:height] >= 2
 
 
 def compare(
     view: FloorView,
     profile: FloorProfile,
-    left: NDArray[np.uint8],
-    right: NDArray[np.uint8],
+    pair: Pair,
     disparity: NDArray[np.float32],
-    on_floor: NDArray[np.bool_],
-    noise_grey: float,
+    heights: Heights,
 ) -> Comparison:
-    """Compare the view's rows of a rectified pair under floor and under the disparities (R, W).
+    """Compare the view's rows of a rectified pair under floor and under the disparities (R, W); of
+    a depth camera, which has no right image, the disparities with the floor's.
 
-    left, right: whole image rows (R, image width). on_floor: (R, W), where the disparities are
-    those of a floor, though not of the profile: it bends only along the way. Where the right image
-    does not reach, nothing speaks against the floor nor for it.
+    Disparities may be those of a floor, though not of the profile: it bends only along the way.
+    Where the right image does not reach, nothing speaks against the floor nor for it.
     """
-    part = np.s_[::STEP_PX, :: STEP_PX // view.step]
+    on_floor = lies_on_floor(view, disparity, heights)
+    floor_px = profile.at_pixels(view.derolled[view.half])
+    if pair.measured is not None:
+        off_px = np.abs(disparity - profile.at_pixels(view.derolled))
+        against = (disparity > 0) & (off_px > np.float32(SAME_PX)) & ~on_floor
+        nowhere, nothing = np.zeros_like(against), np.zeros_like(floor_px)
+        return Comparison(floor_px, against, against, nowhere, ~against, nothing)
+    left, right, noise_grey = pair.left_rows, pair.right[pair.part[0]], pair.noise_grey
     sampled = left[::STEP_PX, ::STEP_PX]
-    steps = (np.arange(0, size, STEP_PX, dtype=np.float32) for size in left.shape)
-    rows, columns = np.meshgrid(*steps, indexing='ij')
-    floor_px = profile.at_pixels(view.derolled[part])
-    matched_px = disparity[part]
-
-    def right_at(disparity_px: NDArray[np.float32]) -> NDArray[np.uint8]:
-        at = columns - disparity_px
-        seen = cv2.remap(right, at, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return seen.astype(np.uint8, copy=False)
-
+    rows, columns = STEP_PX * np.indices(sampled.shape, np.float32)
+    matched_px = disparity[view.half]
     reached = columns >= floor_px + _MARGIN_PX
-    lying = on_floor[part] & (matched_px > 0)
-    as_floor = right_at(np.where(lying, matched_px, floor_px))
-    matched = _local_difference(sampled, right_at(matched_px))
+    lying = on_floor[view.half] & (matched_px > 0)
+    as_floor, as_matched = (
+        cv2.remap(right, columns - px, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for px in (np.where(lying, matched_px, floor_px), matched_px)
+    )
+    matched = _local_difference(sampled, as_matched)
     floor = _local_difference(sampled, as_floor)
     lying &= reached & (np.abs(matched_px - floor_px) < np.float32(SAME_PX))
     foreign = _foreign(sampled, as_floor, lying, noise_grey)
@@ -334,30 +334,28 @@ def compare(
     worse = floor > 1.1 * matched
     denied &= (matched_px > 0) & worse
     denied &= cv2.blur(worse.astype(np.float32), wide) > _WIDE_SHARE
-    contrary = against | foreign
+    contrary = against | denied | foreign
     contrary |= floor > 2 * _LIKENESS_GREY + _NOISE_SHARE * noise_grey
-    contradicted = (against, denied, unlike)
-    masks = (*(mask & reached for mask in contradicted), ~(contrary & reached))
-    costs = Costs(floor, matched, reached.astype(np.float32))
-    against, denied, unlike, consistent = (enlarged(mask, disparity) for mask in masks)
-    return Comparison(floor_px, against, denied, unlike, consistent, costs)
+    against, denied, unlike, contrary = (
+        enlarged(mask & reached, disparity) for mask in (against, denied, unlike, contrary)
+    )
+    better = matched_better(floor, matched, reached, noise_grey)
+    return Comparison(floor_px, against, denied, unlike, ~contrary, better)
 
 
-def compare_measured(
-    view: FloorView,
-    profile: FloorProfile,
-    disparity: NDArray[np.float32],
-    on_floor: NDArray[np.bool_],
-    noise_px: float,
-) -> Comparison:
-    """Compare the floor with disparities (R, W) that a depth camera measured, 0 for none: there is
-    no right image to look at. on_floor: as of `compare`. noise_px: of the disparities, one sigma.
+def matched_better(
+    floor: NDArray[np.float32],
+    matched: NDArray[np.float32],
+    reached: NDArray[np.bool_],
+    noise_grey: float,
+) -> NDArray[np.float32]:
+    """Return the log ratio of how much the images differ on the floor, in grey levels (R, W), to
+    how much they do as matched; 0 where the right image does not reach.
     """
-    floor_px = profile.at_pixels(view.derolled)
-    against = (disparity > 0) & (np.abs(disparity - floor_px) > np.float32(SIGMAS * noise_px))
-    against &= ~on_floor
-    part = np.s_[::STEP_PX, :: STEP_PX // view.step]
-    return Comparison(floor_px[part], against, against, np.zeros_like(against), ~against)
+    sigmas, grey = _UNEQUAL_GREY
+    noise = np.float32(sigmas * noise_grey + grey)
+    ratio = np.log((floor + noise) / (np.minimum(matched, floor) + noise))
+    return np.asarray(ratio * reached)
 
 
 def _foreign(
@@ -389,36 +387,3 @@ def _local_difference(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDAr
     difference = cv2.subtract(left, right, dtype=cv2.CV_32F)
     difference -= cv2.blur(difference, (BLOCK_PX, BLOCK_PX))
     return cv2.blur(np.abs(difference), (BLOCK_PX, BLOCK_PX))
-
-
-def texture_grey(image: NDArray[np.uint8], window_px: int) -> NDArray[np.float32]:
-    """Return the mean absolute slope (H, W) along the row in grey levels per pixel.
-
-    Slopes are taken on a scale of two pixels, where sensor noise has averaged out; only slopes
-    along the row tell a stereo pair anything.
-    """
-    radius = int(3 * _SIGMA_PX)
-    x = np.arange(-radius, radius + 1, dtype=np.float64)
-    smooth = np.exp(-0.5 * (x / _SIGMA_PX) ** 2)
-    smooth /= smooth.sum()
-    slope = x * smooth
-    slope /= (x * slope).sum()
-    # sepFilter2D correlates: a positive slope gives a positive response.
-    response = cv2.sepFilter2D(image, cv2.CV_32F, slope, smooth)
-    return cv2.blur(np.abs(response), (window_px, window_px))
-
-
-def enough_texture(noise_grey: float) -> float:
-    """Return the texture, in grey levels per pixel, that is surely no noise."""
-    return max(_MIN_TEXTURE_GREY, _NOISE_TEXTURE * noise_grey)
-
-
-def row_slope(image: NDArray[np.uint8]) -> NDArray[np.int16]:
-    """Return how steep the image (H, W) is from row to row, as Sobel's response: 8 times the grey
-    levels per row.
-    """
-    smooth = cv2.GaussianBlur(image, (3, 5), 0)
-    slope: NDArray[np.int16] = np.abs(
-        cv2.Sobel(smooth, cv2.CV_16S, 0, 1, borderType=cv2.BORDER_REPLICATE)
-    )
-    return slope

@@ -37,7 +37,7 @@ from segfloor_ros.core.floor.disparity.profile import (
     pixels_where,
     surface_above,
 )
-from segfloor_ros.core.floor.mask.pixel_evidence import (
+from segfloor_ros.core.floor.pair import (
     EDGE_SLOPE,
     TEXTURE_WINDOW_PX,
     enough_texture,

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,17 +64,17 @@ _AT_ONCE = 200
 
 @dataclass(frozen=True)
 class Samples:
-    """Disparities of one frame: rays (N, 3), disparities (N,) in pixels, weights (N,). disparity_m:
-    fx * baseline. rise: (N,), by how much disparities grow per row around the samples, None where
-    that is not known; down: by how much rays change per row.
+    """Disparities of one frame: rays (N, 3), disparities (N,) in pixels, weights (N,). rise: (N,),
+    by how much disparities grow per row around the samples, NaN where that is not known.
+    disparity_m: fx * baseline. down: by how much rays change per row.
     """
 
     rays: Array
     disparity_px: Array
     weight: Array
+    rise: Array
     disparity_m: float
-    rise: Array | None = None
-    down: float = 0.0
+    down: float
 
     @classmethod
     def of(
@@ -86,8 +87,8 @@ class Samples:
     ) -> Samples:
         """Return the samples at pixels (N, 2)."""
         rays = camera.back_project(uv_px, np.ones(len(uv_px)))
-        constant = camera.disparity_times_depth
-        return cls(rays, disparity_px, weight, constant, rise, 1.0 / camera.fy)
+        rise = np.full(len(uv_px), np.nan) if rise is None else rise
+        return cls(rays, disparity_px, weight, rise, camera.disparity_times_depth, 1.0 / camera.fy)
 
     def every(self, step: int) -> Samples:
         """Return only one of every so many, which weighs as much as these."""
@@ -96,25 +97,14 @@ class Samples:
 
     def take(self, rows: slice | NDArray[np.intp]) -> Samples:
         """Return the chosen ones."""
-        return replace(
-            self,
-            rays=self.rays[rows],
-            disparity_px=self.disparity_px[rows],
-            weight=self.weight[rows],
-            rise=None if self.rise is None else self.rise[rows],
-        )
+        return replace(self, **{name: getattr(self, name)[rows] for name in _OF_EACH})
 
     @classmethod
     def joined(cls, frames: Sequence[Samples]) -> Samples:
         """Return the samples of at least one frame of one camera as those of one."""
-        rises = [frame.rise for frame in frames if frame.rise is not None]
-        return replace(
-            frames[0],
-            rays=np.concatenate([frame.rays for frame in frames]),
-            disparity_px=np.concatenate([frame.disparity_px for frame in frames]),
-            weight=np.concatenate([frame.weight for frame in frames]),
-            rise=np.concatenate(rises) if rises else None,
-        )
+        columns = {name: [getattr(frame, name) for frame in frames] for name in _OF_EACH}
+        joined: dict[str, Any] = {name: np.concatenate(all_) for name, all_ in columns.items()}
+        return replace(frames[0], **joined)
 
     def near(self, angles_height: Array) -> Samples:
         """Return only those that matter where a plane, (3,), is refined that is nearly known."""
@@ -127,20 +117,19 @@ class Samples:
         """Return the weights (N,) for a plane (3,): little where disparities do not rise down the
         image as those of the plane do.
         """
-        if self.rise is None:
-            return self.weight
         slope = -self.disparity_m * self.down * float(plane[1])
-        return self.weight * np.where(is_rise(self.rise, slope), 1.0, _FLAT_WEIGHT)
+        rises = is_rise(self.rise, slope) | np.isnan(self.rise)
+        return self.weight * np.where(rises, 1.0, _FLAT_WEIGHT)
 
 
+_OF_EACH = ('rays', 'disparity_px', 'weight', 'rise')
+"""What `Samples` have of each pixel."""
 LOOKS = 4
 """By so many frames it is seen how much a plane varies."""
 SWAY = (math.radians(2.0), math.radians(2.5), 0.04)
 """How much pitch, roll and height, as a share of it, of the camera above the floor vary on the way,
 as standard deviations: robots sway, and where they are is known so well.
 """
-_INTERVAL_PERCENT = (2.5, 16, 50, 84, 97.5)
-"""One and two sigmas to either side of the median: a few wrong planes do not count."""
 _LEAST_SUPPORT, _MOST_BELOW = 0.08, 0.15
 """A floor is so much of what is seen where it is visible. What is seen below it, of mirrors and
 wrong matches, is so small a share of that: of true floors 0.11 at most, of boards 0.2 to 0.4.
@@ -195,7 +184,8 @@ class Fixture:
             return
         self._planes.append(fit.angles_height)
         heights_m = np.array(self._planes)[:, 2]
-        low, minus, middle, plus, high = np.percentile(heights_m, _INTERVAL_PERCENT)
+        # One and two sigmas to either side of the median: a few wrong planes do not count.
+        low, minus, middle, plus, high = np.percentile(heights_m, (2.5, 16, 50, 84, 97.5))
         if len(heights_m) >= LOOKS and plus - minus > 2 * SWAY[2] * middle:
             self.problem = (
                 'the camera is not fixed to its base: its height above the floor varies by '
@@ -327,11 +317,9 @@ def _jacobian(angles_height: Array) -> Array:
     """Return dm / d(pitch, roll, height) (3, 3)."""
     pitch, roll, height = (float(value) for value in angles_height)
     (sp, cp), (sr, cr) = ((math.sin(angle), math.cos(angle)) for angle in (pitch, roll))
-    by_angles = np.array(
-        [[sp * sr, -cp * cr, cp * sr / height], [sp * cr, cp * sr, cp * cr / height]]
-    )
-    by_angles = np.vstack([by_angles, [-cp, 0.0, sp / height]])
-    return by_angles / height
+    right = (sp * sr, -cp * cr, cp * sr / height)
+    down = (sp * cr, cp * sr, cp * cr / height)
+    return np.array([right, down, (-cp, 0.0, sp / height)]) / height
 
 
 def _normal_equations(samples: Samples, state: Array, scale: float) -> tuple[Array, Array, Array]:

@@ -7,20 +7,20 @@ from floor_scenes import CAMERA, MOUNT
 from segfloor_ros.core.floor.disparity.profile import (
     FloorView,
     filtered_v_disparity,
+    histogram,
     obstacle_rows,
     rising,
-    u_disparity,
-    v_disparity,
 )
 
 
-def test_u_disparity_counts_per_column_and_ignores_no_match():
+def test_u_disparity_counts_per_column():
     bins = np.array([[0, 2, 3], [1, 2, 3], [1, 2, 0], [1, 0, 1]])
-    assert u_disparity(bins, 4).tolist() == [[0, 0, 0], [3, 0, 1], [0, 3, 0], [0, 0, 2]]
+    counts = histogram(bins, np.arange(3), (4, 3))
+    assert counts.tolist() == [[1, 1, 1], [3, 0, 1], [0, 3, 0], [0, 0, 2]]
 
 
 def test_v_disparity_counts_per_row():
-    counts = v_disparity(np.array([0, 0, 2, 2, 2]), np.array([1, 1, 3, 0, 3]), (3, 4))
+    counts = histogram(np.array([0, 0, 2, 2, 2]), np.array([1, 1, 3, 0, 3]), (3, 4))
     assert counts.tolist() == [[0, 2, 0, 0], [0, 0, 0, 0], [1, 0, 0, 2]]
 
 
@@ -51,5 +51,5 @@ def test_what_covers_as_many_rows_as_an_obstacle_is_not_counted(period, share):
     rows = np.arange(240)[:, None] % period
     disparity = np.broadcast_to(20 + view.line.slope * rows, view.derolled.shape)
     textured = np.ones(disparity.shape, bool)
-    seen = filtered_v_disparity(view, disparity.astype(np.float32), textured, 128, 1)
+    seen = filtered_v_disparity(view, disparity.astype(np.float32), textured, 128)
     assert seen.counts.sum() / disparity.size / view.step == pytest.approx(share, abs=0.1)

@@ -6,8 +6,9 @@ from floor_scenes import CAMERA, MOUNT
 
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.floor.disparity.profile import FloorLine, FloorProfile, FloorView
-from segfloor_ros.core.floor.mask.filling import fill_to_contact, upright_above
-from segfloor_ros.core.floor.mask.pixel_evidence import Comparison
+from segfloor_ros.core.floor.mask.filling import fill_to_contact
+from segfloor_ros.core.floor.mask.pixel_evidence import Comparison, FrameEvidence
+from segfloor_ros.core.floor.pair import Pair
 
 FIRST_ROW = 200
 SEEN_ROW, CONTACT_ROW = 160, 80  # of the view: floor is seen from the one, a wall up to the other
@@ -36,11 +37,12 @@ def filled(
     foot_px = float(profile.at_rows(np.array([FIRST_ROW + CONTACT_ROW]))[0])
     disparity = np.where(wall, wall_px_of_floor * foot_px, 0).astype(np.float32)
     floor_px = profile.at_pixels(view.derolled[::2, :: 2 // view.step])
-    compared = Comparison(floor_px, wall, wall, wall, ~wall)
+    compared = Comparison(floor_px, wall, wall, wall, ~wall, np.zeros_like(floor_px))
     plain = ~wall[::2, :: 2 // view.step]
     may_begin = (rows >= shape[0] - alike_rows)[::2, :: 2 // view.step]
-    upright_px = upright_above(view, disparity, compared, wall & has_texture)
-    result = fill_to_contact(view, mask, plain, may_begin, upright_px, compared)
+    pair = Pair(*6 * [None], 0.0, 1.0, texture=np.where(wall & has_texture, 2.0, 0.0))
+    frame = FrameEvidence(view, profile, pair, disparity, None, compared)
+    result = fill_to_contact(frame, mask, plain, may_begin)
     assert not result[rows[::2, :: 2 // view.step] < CONTACT_ROW].any()
     return result[CONTACT_ROW // 2 : SEEN_ROW // 2]
 

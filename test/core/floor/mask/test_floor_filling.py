@@ -6,7 +6,8 @@ from floor_scenes import CAMERA, FLOORS, MOUNT, Patch, Scene, floor_patch, wall
 
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.floor.disparity.profile import FloorView
-from segfloor_ros.core.floor.mask.filling import beside_something, drop_islands, image_slope
+from segfloor_ros.core.floor.mask.filling import beside_something, drop_islands
+from segfloor_ros.core.floor.pair import image_slope
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 

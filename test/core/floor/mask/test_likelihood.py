@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from floor_scenes import SMALL_CAMERA, Scene, floor_patch, wall
 
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.floor.mask.likelihood import (
@@ -15,7 +16,9 @@ from segfloor_ros.core.floor.mask.likelihood import (
     features,
     known_weight,
 )
-from segfloor_ros.core.floor.mask.pixel_evidence import Costs
+from segfloor_ros.core.floor.mask.pixel_evidence import matched_better
+from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
 SHAPE, SLOPE = (120, 200), 0.15
 ROWS, COLUMNS = np.indices(SHAPE, np.float32)
@@ -29,16 +32,14 @@ def ground(seed: int = 0) -> Seen:
     rng = np.random.default_rng(seed)
     floor_px = 10 + 2 * SLOPE * ROWS
     matched_px = floor_px + rng.normal(0, 0.5, SHAPE)
-    costs = Costs(*np.full((2, *SHAPE), 1.2, np.float32), np.ones(SHAPE, np.float32))
     return Seen(
-        first_row=0,
         floor_px=floor_px,
         disparity_px=matched_px.astype(np.float32),
         slope=SLOPE,
         texture=np.full(SHAPE, 2.0, np.float32),
         lower=np.zeros(SHAPE, bool),
         grey=(100 + rng.normal(0, 12, SHAPE)).astype(np.float32),
-        costs=costs,
+        better=np.zeros(SHAPE, np.float32),
         noise_grey=NOISE_GREY,
         is_floor=np.ones(SHAPE, bool),
     )
@@ -103,22 +104,42 @@ def test_what_has_no_texture_or_no_match_says_nothing_of_its_height() -> None:
             assert not parts[name].any()
     flat = dataclasses.replace(seen, grey=np.full(SHAPE, 100, np.float32))
     assert known_weight(flat).max() < 0.1 < known_weight(seen).mean()
-    assert known_weight(dataclasses.replace(flat, costs=None)).min() == 1
+    assert known_weight(dataclasses.replace(flat, noise_grey=0.0)).min() == 1
 
 
 def test_images_that_differ_on_the_floor_and_not_as_matched_deny_it() -> None:
     seen = ground()
-    floor = np.full(SHAPE, 1.2, np.float32)
+    floor, matched = np.full((2, *SHAPE), 1.2, np.float32)
     floor[:, 100:] = 12.0
-    reached = np.ones(SHAPE, np.float32)
-    reached[60:] = 0
-    costs = Costs(floor, np.full(SHAPE, 1.2, np.float32), reached)
-    parts = named(dataclasses.replace(seen, costs=costs))
+    better = matched_better(floor, matched, ROWS < 60, NOISE_GREY)
+    parts = named(dataclasses.replace(seen, better=better))
     assert parts['matched'][:60, 100:].min() > 1.5
     for where in (np.s_[:, :100], np.s_[60:]):
         assert parts['matched'][where].max() < 0.2
-    measured = named(dataclasses.replace(seen, costs=None))
-    assert not measured['matched'].any()
+    unmatched = named(dataclasses.replace(seen, better=better, disparity_px=0 * floor))
+    assert not unmatched['matched'].any()
+
+
+def test_a_depth_camera_has_no_second_image_that_could_deny_the_floor() -> None:
+    """Nor has noise of its image any part in how well its depth is known."""
+    kept: list[Seen] = []
+
+    class Recorder(Likelihood):
+        def weighed(self, mask: np.ndarray, seen: Seen) -> np.ndarray:
+            kept.append(seen)
+            return mask
+
+    scene = Scene([floor_patch(), wall(2.0)], SMALL_CAMERA, noise_grey=2.0)
+    left, right, _, depth_m = scene.render()
+    disparity_px = (SMALL_CAMERA.disparity_times_depth / depth_m).astype(np.float32)
+    for second in (right, disparity_px):
+        stage = FloorSegmentation(SMALL_CAMERA, FloorSegmentationSettings())
+        stage.likelihood = Recorder()
+        stage.process(left, second, scene.mount)
+    images, measured = kept
+    assert images.better.any() and not measured.better.any()
+    assert images.noise_grey > 1 and measured.noise_grey == 0
+    assert np.all(known_weight(measured)[measured.disparity_px > 0] == 1)
 
 
 def test_what_is_darker_or_brighter_than_the_floor_does_not_look_like_it() -> None:

@@ -16,12 +16,17 @@ from segfloor_ros.core.floor.plane.plane import LEVEL_SIGMA, PlaneFit, Samples, 
 from segfloor_ros.core.twists import se3_exp
 
 UNKNOWN, STILL = np.full(3, np.nan), np.zeros((0, 3))
-NOTHING = Samples(np.zeros((0, 3)), np.zeros(0), np.zeros(0), 1.0)
+NOTHING = Samples(np.zeros((0, 3)), *np.zeros((3, 0)), 1.0, 0.0)
 DISPARITY_M = 40.0
 CAMERA = StereoCamera(320, 240, 160.0, 160.0, 159.5, 119.5, 0.25)
 VGA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.25)
 TRUE = np.array([0.3, 0.0, 0.5])
 """Pitch, roll and height of the camera."""
+
+
+def weighing_alike(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights (N,) of samples, and how their disparities grow, which is not known."""
+    return np.ones(count), np.full(count, np.nan)
 
 
 def little_floor(seed: int) -> Samples:
@@ -31,7 +36,7 @@ def little_floor(seed: int) -> Samples:
     rays = np.stack([u, v, np.ones(80)], axis=1)
     disparity = -DISPARITY_M * rays @ plane_of(TRUE)
     disparity += 0.4 + 3 * u + rng.normal(0, 0.2, 80)
-    return Samples(rays, disparity, np.ones(80), DISPARITY_M)
+    return Samples(rays, disparity, *weighing_alike(80), DISPARITY_M, 0.0)
 
 
 def found(frames: list[Samples], up: Up | None) -> np.ndarray:
@@ -65,7 +70,7 @@ def test_a_floor_that_is_plain_to_see_counts_more_than_what_was_felt() -> None:
     u, v = rng.uniform(-0.8, 0.8, 3000), rng.uniform(0.0, 0.8, 3000)
     rays = np.stack([u, v, np.ones(3000)], axis=1)
     disparity = -DISPARITY_M * rays @ plane_of(TRUE) + rng.normal(0, 0.2, 3000)
-    frame = Samples(rays, disparity, np.ones(3000), DISPARITY_M)
+    frame = Samples(rays, disparity, *weighing_alike(3000), DISPARITY_M, 0.0)
     # The robot starts on a ramp of 4 degrees.
     ramp = plane_of(np.array([TRUE[0] + math.radians(4.0), 0.0, 1.0]))
     angles = found([frame] * 4, Up(ramp, math.radians(0.5)))
@@ -84,9 +89,9 @@ def test_what_stands_far_away_does_not_tilt_the_floor(rises_are_known: bool) -> 
     is_thing = v < 0.2
     disparity = -DISPARITY_M * rays @ plane_of(level) + rng.normal(0, 0.1, 900)
     disparity[is_thing] += 1.5
-    rise = np.where(is_thing, 0.0, slope) if rises_are_known else None
+    rise = np.where(is_thing, 0.0, slope) if rises_are_known else np.full(len(rays), np.nan)
     weight = np.where(is_thing, 4.0, 1.0)
-    frame = Samples(rays, disparity, weight, DISPARITY_M, rise, down)
+    frame = Samples(rays, disparity, weight, rise, DISPARITY_M, down)
     height_m = found([frame] * 4, None)[2]
     assert (abs(height_m - 0.5) < 0.01) == rises_are_known
 
@@ -109,7 +114,7 @@ def test_all_samples_near_a_plane_refine_it() -> None:
         rays = np.stack([u, v, np.ones(3000)], axis=1)
         disparity = -DISPARITY_M * rays @ plane_of(TRUE) + rng.normal(0, 0.4, 3000)
         fit = search.add(
-            Samples(rays, disparity, np.ones(3000), DISPARITY_M),
+            Samples(rays, disparity, *weighing_alike(3000), DISPARITY_M, 0.0),
             level_prior(None, np.eye(4)),
             STILL,
             [],
@@ -132,7 +137,7 @@ def test_how_a_plane_is_known() -> None:
     unsure = np.array([0.5, 0.5, 1.0])
 
     def fit(disparity: np.ndarray, rise: np.ndarray) -> PlaneFit:
-        frame = Samples(rays, disparity, np.ones(3000), DISPARITY_M, rise, down)
+        frame = Samples(rays, disparity, np.ones(3000), rise, DISPARITY_M, down)
         return refine(Samples.joined([frame] * 20), TRUE, UNKNOWN, STILL, TRUE, unsure)
 
     exact, off = fit(true_px, rise), fit(true_px + OFFSET_SIGMA_PX, rise)
@@ -154,7 +159,7 @@ def test_what_differs_between_parts_of_a_drive_is_not_known() -> None:
         search = PlaneSearch(UNKNOWN)
         for height_m in 0.5 * (1 + spread * np.array([-1.0, 1.0, -0.6, 0.8])):
             disparity = -DISPARITY_M * rays @ plane_of(np.array([0.3, 0.0, height_m]))
-            frame = Samples(rays, disparity, np.ones(3000), DISPARITY_M)
+            frame = Samples(rays, disparity, *weighing_alike(3000), DISPARITY_M, 0.0)
             search.add(frame, level_prior(None, np.eye(4)), STILL, [])
         known[spread] = search.is_known()
     assert known == {0.0: True, 0.1: False}
@@ -179,7 +184,7 @@ def test_a_plane_below_which_much_is_seen_is_no_floor(
     search = PlaneSearch(UNKNOWN)
     for _ in range(4):
         fit = search.add(
-            Samples(rays, disparity, np.ones(3000), DISPARITY_M),
+            Samples(rays, disparity, *weighing_alike(3000), DISPARITY_M, 0.0),
             level_prior(None, np.eye(4)),
             STILL,
             [],
