@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 
-from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration, eye_calibration
+from segfloor_ros.core.camera.calibration import StereoCalibration
+from segfloor_ros.core.camera.camera_info import eye_calibration
 from segfloor_ros.core.camera.depth import depth_calibration, disparity_of_depth
 from segfloor_ros.core.camera.images import EightBitScale, depth_image, grey_image
 from segfloor_ros.core.camera.rectification import StereoRectifier
@@ -26,10 +27,10 @@ from segfloor_ros.core.contracts import InputFault, Mount
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.nodes.messages.camera_infos import same_calibration
 from segfloor_ros.nodes.messages.diagnostics import LASTS_S, RECENT, Level
-from segfloor_ros.nodes.messages.topics import IMAGES, KEYFRAMES, PATIENCE_S, best_effort
+from segfloor_ros.nodes.messages.topics import IMAGES, KEYFRAMES, LATCHED, PATIENCE_S, best_effort
 from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import DISCOVERY_S
-from segfloor_ros.nodes.shared.reporter import offered_best_effort
+from segfloor_ros.nodes.shared.reporter import offered
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 
 CATCH_UP = 0.2
@@ -115,7 +116,7 @@ class StereoInput:
         self._on_news = on_news
         self.pairs = PairQueue()
         self._infos: dict[str, CameraInfo] = {}
-        self._eyes: dict[str, EyeCalibration] = {}
+        self._latched: set[str] = set()
         self._takes_best_effort = own.image_reliability == 'best_effort'
         self._kinds = [
             kind
@@ -128,7 +129,8 @@ class StereoInput:
         self._choose(self._kinds[0])
         for info in INFOS:
             take = partial(self._take_info, info)
-            node.inputs.subscribe(info, take, self._choose_profile, takes_all=True)
+            choose = partial(self._choose_profile, info)
+            node.inputs.subscribe(info, take, choose, takes_all=True)
         # What waits for a partner, and a whole queue that is taken at once, find room.
         for kind in self._kinds:
             node.inputs.join(
@@ -167,7 +169,7 @@ class StereoInput:
     @property
     def missing_calibrations(self) -> list[str]:
         """The topics on which no calibration has come."""
-        return [topic for topic in self._infos_needed if topic not in self._eyes]
+        return [topic for topic in self._infos_needed if topic not in self._infos]
 
     @property
     def _infos_needed(self) -> tuple[str, ...]:
@@ -182,8 +184,7 @@ class StereoInput:
     def rectifier(self) -> StereoRectifier:
         """What rectifies, made for the calibration at the first pair."""
         if self._rectifier is None:
-            taken = self.calibration if self._is_rectified else self._raw_calibration()
-            self._rectifier = StereoRectifier(taken)
+            self._rectifier = StereoRectifier(self._raw_calibration())
         return self._rectifier
 
     def images(self, pair: Pair) -> tuple[NDArray[np.uint8], NDArray[Any]]:
@@ -238,37 +239,42 @@ class StereoInput:
         topics = (kind.left, kind.right)
         return all(self._node.get_publishers_info_by_topic(topic) for topic in topics)
 
-    def adapt_reliability(self) -> None:
+    def adapt_to_offers(self) -> None:
         """Take the images best effort where a driver offers no more, if the choice is left to the
-        node.
+        node, and a calibration that was published once, before.
         """
-        if self._takes_best_effort or self._own.image_reliability != 'auto':
-            return
-        lossy = offered_best_effort(self._node, (*self._infos_needed, self.left, self.right))
-        if lossy:
-            self._takes_best_effort = True
-            names = ', '.join(lossy)
-            self._node.get_logger().info(
-                f'receives best effort, as offered: {names}; images may get lost'
-            )
-            self._node.inputs.reopen()
+        node, reopens = self._node, False
+        if not self._takes_best_effort and self._own.image_reliability == 'auto':
+            topics = (*self._infos_needed, self.left, self.right)
+            lossy = offered(node, topics, reliability=ReliabilityPolicy.BEST_EFFORT)
+            if lossy:
+                self._takes_best_effort = reopens = True
+                node.get_logger().info(
+                    f'receives best effort, as offered: {", ".join(lossy)}; images may get lost'
+                )
+        missing = {*self.missing_calibrations} - self._latched
+        if latched := offered(node, missing, durability=DurabilityPolicy.TRANSIENT_LOCAL):
+            self._latched.update(latched)
+            reopens = True
+        if reopens:
+            node.inputs.reopen()
 
-    def _choose_profile(self) -> QoSProfile:
+    def _choose_profile(self, topic: str = '') -> QoSProfile:
+        if topic in self._latched:
+            return LATCHED
         return best_effort(IMAGES) if self._takes_best_effort else IMAGES
 
     def _raw_calibration(self) -> StereoCalibration:
-        if self._kind.is_depth:
-            eye = self._eyes[INFOS[0]]
-            if self._is_rectified:
-                eye = EyeCalibration.of_rectified(eye.width, eye.height, eye.P, eye.origin)
-            return depth_calibration(eye)
-        return StereoCalibration(*(self._eyes[topic] for topic in INFOS))
+        """Return the calibration of the images as they come. Raises CalibrationError."""
+        eyes = [eye_calibration(self._infos[t], t, self._is_rectified) for t in self._infos_needed]
+        return depth_calibration(eyes[0]) if self._kind.is_depth else StereoCalibration(*eyes)
 
     def _take_info(self, topic: str, message: CameraInfo) -> None:
         if topic in self._infos and same_calibration(message, self._infos[topic]):
             return
-        self._eyes[topic] = eye_calibration(message, topic)
         self._infos[topic] = message
+        is_rectified = self._is_rectified or not self._is_published(self._kind)
+        eye_calibration(message, topic, is_rectified)
         if self._rectifier is not None:
             text = f'{topic}: the calibration is not the one in use; ~/reset takes it over'
             self._node.reporter.diagnose(f'calibration on {topic}', text, lasts_s=PATIENCE_S)

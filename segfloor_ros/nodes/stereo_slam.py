@@ -100,7 +100,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
 
     def find_problems(self) -> None:
         """Follow what the driver offers, and report what is wrong with the camera."""
-        self._camera.adapt_reliability()
+        self._camera.adapt_to_offers()
         self._sensors.adapt_reliability()
         missing = self._camera.missing_calibrations if self._camera.pairs else []
         self._camera.watch.find_problems(missing)

@@ -24,7 +24,8 @@ from segfloor_ros.apps.recordings.files import (
     rate_of,
 )
 from segfloor_ros.apps.recordings.source import PairEntry, StampPairing, StereoSource
-from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration, eye_calibration
+from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.core.camera.camera_info import eye_calibration
 from segfloor_ros.core.camera.depth import depth_calibration, disparity_of_depth
 from segfloor_ros.core.camera.images import Grey, colour_image, depth_image, grey_image
 from segfloor_ros.core.camera.measurements import (
@@ -74,13 +75,12 @@ def open_bag(path: Path, settings: StereoCameraSettings) -> StereoSource:
             topics = bag_topics.find_topics(
                 str(path), types, settings.left_image_topic, settings.right_image_topic
             )
-            calibration = given_calibration(settings) or _read_calibration(path, bag, topics)
+            given = given_calibration(settings, topics.is_rectified)
+            calibration = given or _read_calibration(path, bag, topics)
         count = min(bag.topics[topic].num_messages for topic in (topics.left, topics.right))
         first = islice(bag.messages([topics.left]), FIRST_MESSAGES)
         stamps = sorted(_stamp_ns(message, f'{path}, {topics.left}') for _, message in first)
         rate_hz = rate_of(stamps)
-        if topics.is_rectified:
-            calibration = calibration.rectified()
         sensors = bag_sensors(path, bag, topics.left, calibration.left.R, settings)
         if stamps:
             # The end is not known before all images are read; half of them may be missing.
@@ -144,8 +144,9 @@ def _read_calibration(
     path: Path, bag: BagFile, topics: bag_topics.StereoTopics
 ) -> StereoCalibration:
     given = 'stereo_camera.left_calibration and right_calibration'
-    left = _eye(path, bag, topics.left, topics.left_info, given)
-    return StereoCalibration(left, _eye(path, bag, topics.right, topics.right_info, given))
+    sides = (topics.left, topics.left_info), (topics.right, topics.right_info)
+    eyes = (_eye(path, bag, *side, given, topics.is_rectified) for side in sides)
+    return StereoCalibration(*eyes)
 
 
 def _left_eye(
@@ -153,16 +154,19 @@ def _left_eye(
 ) -> EyeCalibration:
     given = given_left_calibration(settings)
     if given is not None:
-        return given
-    return _eye(path, bag, topics.left, topics.left_info, 'stereo_camera.left_calibration')
+        return given.rectified() if topics.is_rectified else given
+    setting = 'stereo_camera.left_calibration'
+    return _eye(path, bag, topics.left, topics.left_info, setting, topics.is_rectified)
 
 
-def _eye(path: Path, bag: BagFile, image: str, topic: str, setting: str) -> EyeCalibration:
+def _eye(
+    path: Path, bag: BagFile, image: str, topic: str, setting: str, is_rectified: bool
+) -> EyeCalibration:
     if not topic:
         raise CalibrationError(
             f'{path}: no CameraInfo beside {image}; record it too, or give {setting}'
         )
-    return eye_calibration(bag.first(topic), f'{path}, {topic}')
+    return eye_calibration(bag.first(topic), f'{path}, {topic}', is_rectified)
 
 
 def bag_sensors(

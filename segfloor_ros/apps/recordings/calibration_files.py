@@ -41,9 +41,9 @@ FILE_NAMES = (
 )
 
 
-def read_calibration(left: Path, right: Path) -> StereoCalibration:
+def read_calibration(left: Path, right: Path, is_rectified: bool = False) -> StereoCalibration:
     """Read a pair of ROS camera calibration files or of EuRoC sensor files, or one file of Kalibr,
-    twice.
+    twice. is_rectified: for images that are rectified already.
 
     Raises CalibrationError naming the file when one is missing, incomplete or impossible.
     """
@@ -253,8 +253,11 @@ def _whole(value: Any, where: str) -> int:
     return value
 
 
-def given_calibration(settings: StereoCameraSettings) -> StereoCalibration | None:
-    """Return the calibration that the settings name, or None when they name none.
+def given_calibration(
+    settings: StereoCameraSettings, is_rectified: bool = False
+) -> StereoCalibration | None:
+    """Return the calibration that the settings name, or None when they name none. is_rectified:
+    the images are rectified already, by their own projections.
 
     Raises CalibrationError, also when only one of the two files is given.
     """
@@ -268,7 +271,7 @@ def given_calibration(settings: StereoCameraSettings) -> StereoCalibration | Non
             'stereo_camera.left_calibration and stereo_camera.right_calibration belong together; '
             f'only {left or right} is given'
         )
-    return read_calibration(Path(left), Path(right))
+    return read_calibration(Path(left), Path(right), is_rectified)
 
 
 def given_left_calibration(settings: StereoCameraSettings) -> EyeCalibration | None:

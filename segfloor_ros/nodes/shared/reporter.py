@@ -217,14 +217,16 @@ def one_line(error: Exception) -> str:
     return text if isinstance(error, SegfloorError) else f'{type(error).__name__}: {text}'
 
 
-def offered_best_effort(node: Node, topics: Iterable[str]) -> list[str]:
-    """Return the topics that somebody publishes best effort, which reaches no reliable listener."""
-    lossy = ReliabilityPolicy.BEST_EFFORT
+def offered(node: Node, topics: Iterable[str], **policies: object) -> list[str]:
+    """Return the topics that somebody publishes with some policies, e.g. best effort, which reaches
+    no reliable listener.
+    """
+    wanted = policies.items()
     return [
         topic
         for topic in topics
         if any(
-            info.qos_profile.reliability == lossy
+            all(getattr(info.qos_profile, name) == policy for name, policy in wanted)
             for info in node.get_publishers_info_by_topic(topic)
         )
     ]
