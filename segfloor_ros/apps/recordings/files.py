@@ -78,21 +78,29 @@ def read_times(path: Path) -> list[int]:
     Raises InputError naming the line where one is no number or earlier than the one before; and
     where all are the same.
     """
-    lines = [(where, time_of(line)) for where, line in read_lines(path)]
-    digits = digits_of((time for _, time in lines), str(path))
+    stamps = stamps_of(path, [time_of(line) for _, line in read_lines(path)])
+    if len(stamps) > 1 and stamps[0] == stamps[-1]:
+        raise InputError(
+            f'{path}: all {len(stamps)} times are the same; it needs the time in seconds of each '
+            'pair, or remove it to read the images at stereo_camera.rate_hz'
+        )
+    return stamps
+
+
+def stamps_of(path: Path, times: Sequence[str]) -> list[int]:
+    """Return the stamps in ns of the times in the lines of a file. Raises InputError naming the
+    line.
+    """
+    digits = digits_of(times, str(path))
+    wheres = (where for where, _ in read_lines(path))
     stamps: list[int] = []
-    for where, time in lines:
+    for where, time in zip(wheres, times, strict=True):
         try:
             stamp_ns = nanoseconds(time, digits)
         except ValueError as error:
             raise InputError(f'{where}: expected a time in seconds ({error})') from None
         check_forward(where, stamps[-1:], stamp_ns)
         stamps.append(stamp_ns)
-    if len(stamps) > 1 and stamps[0] == stamps[-1]:
-        raise InputError(
-            f'{path}: all {len(stamps)} times are the same; it needs the time in seconds of each '
-            'pair, or remove it to read the images at stereo_camera.rate_hz'
-        )
     return stamps
 
 

@@ -70,6 +70,10 @@ no measurement."""
 WHITE_SHARE = 1 / 3
 """Lamps, windows and the sky whiten less."""
 
+NEAREST_M, NEAREST_PERCENT = (0.25, 4.0), 95
+"""The nearest twentieth of what a depth camera of a robot measures is farther than it reaches down
+to, and no farther than the floor or the walls around it; other figures have another unit."""
+
 SAME_EYES, EYES_RATIO = 1.07, 1.25
 """Two good cameras with exposures of their own differ by up to the one; the other is a fault."""
 
@@ -103,6 +107,13 @@ FAULTS = {
         'are not aligned: the edges of depth fit those of the image best moved by {value:.0f} px '
         'and {scale:.2f} times as large',
         'give depth that is registered to the image (aligned_depth_to_color, depth_registered)',
+    ),
+    'depth_scale': (
+        'm',
+        'do not fit: the nearest depths are {value:.2g} m, those of a robot are '
+        f'{NEAREST_M[0]:g} to {NEAREST_M[1]:g} m',
+        'set stereo_camera.depth_scale to the metres of one unit of depth (0.001 for mm, 0.0002 in '
+        'the TUM RGB-D benchmark), or let the driver publish 16UC1 in mm or 32FC1 in m',
     ),
     'not_simultaneous': (
         'ms',
@@ -174,6 +185,7 @@ class RigCheck:
         self._moving_looks = self._watched = 0
         self._has_gap = False
         self._depth = DepthCheck()
+        self._nearest_px: deque[float] = deque(maxlen=RECENT)
         self._calibration = CalibrationCheck(camera)
 
     @timed
@@ -200,6 +212,7 @@ class RigCheck:
             self._images = 'image and depth'
             if is_look:
                 self._pictures.append(_picture([frame.left]))
+                self._judge_scale(frame.right)
                 self._judge_depth(frame)
                 self._judge_pictures()
         elif is_look or (self.frames % EVERY == EVERY // 2 and not self._calibration.is_done):
@@ -368,6 +381,16 @@ class RigCheck:
             self._found('blurred', edge_px)
         if white_share > WHITE_SHARE:
             self._found('saturated', 100 * white_share)
+
+    def _judge_scale(self, disparity: NDArray[np.float32]) -> None:
+        measured = disparity[::4, ::4][disparity[::4, ::4] > 0]
+        if len(measured) < MIN_MATCHES:
+            return
+        self._nearest_px.append(float(np.percentile(measured, NEAREST_PERCENT)))
+        nearest_m = self._camera.disparity_times_depth / float(np.median(self._nearest_px))
+        self.faults.pop('depth_scale', None)
+        if not NEAREST_M[0] <= nearest_m <= NEAREST_M[1]:
+            self._found('depth_scale', nearest_m)
 
     def _judge_depth(self, frame: StereoFrame) -> None:
         if self._before is None:
