@@ -25,6 +25,7 @@ from segfloor_ros.apps.cli import printing, terminal
 from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.apps.cli.terminal import figure_table, number_option, value_table
 from segfloor_ros.apps.cli.view import open_view, show_recording, show_results
+from segfloor_ros.apps.map_files import is_map, load_map, map_facts
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.bag_writer import BagWriter, ImageCoding, NewBag
 from segfloor_ros.apps.recordings.bag_writer import convert as write_bag
@@ -81,6 +82,13 @@ def _known_output(path: Path) -> str:
         return (
             f'results of a drive, {made}: {summary["tracked_frames"]} of {summary["frames"]} '
             f'frames tracked, {summary["keyframes"]} keyframes'
+        )
+    if is_map(path):
+        facts = map_facts(load_map(path))
+        width, height = facts['size_m']
+        return (
+            f'a map of map_server: {width:.1f} x {height:.1f} m known, {facts["free_m2"]:.1f} m² '
+            f'free, {facts["occupied_m2"]:.1f} m² occupied'
         )
     if path.is_file() and is_map_file(path):
         return 'a saved map of segfloor; take it with --load-map'
