@@ -46,6 +46,9 @@ Pair = dict[str, Any]
 
 StampedPair = tuple[int, Pair]
 
+REMEMBERED = 10 * RECENT
+"""Stamps of images, so that one side may be late."""
+
 PLAUSIBLE_ROLL_DEG, PLAUSIBLE_PITCH_DEG = 20.0, 60.0
 """Beyond these a mount that was measured is hard to believe."""
 
@@ -291,7 +294,7 @@ class CameraWatch:
 
     def expect(self, left: str, right: str) -> None:
         """Watch these two topics from now on."""
-        self._stamps: dict[str, deque[int]] = {t: deque(maxlen=RECENT) for t in (left, right)}
+        self._stamps: dict[str, deque[int]] = {t: deque(maxlen=REMEMBERED) for t in (left, right)}
         self._last_image_s: dict[str, float] = {}
         self._taken: deque[bool] = deque(maxlen=RECENT)
         self._is_live = False
@@ -377,7 +380,7 @@ class CameraWatch:
 
     def _find_unstamped(self) -> None:
         for topic, stamps in self._stamps.items():
-            if len(stamps) == RECENT and not any(stamps):
+            if len(stamps) >= RECENT and not any(stamps):
                 self._node.reporter.diagnose(
                     f'stamps of {topic}',
                     f'all stamps on {topic} are zero: no pair can be tracked; let the driver '
@@ -404,7 +407,11 @@ class CameraWatch:
         both_come = all(now_s - last_s < 1.0 for last_s in self._last_image_s.values())
         if not both_come or len(left) < RECENT or len(right) < RECENT:
             return
-        gap_ns = median(min(abs(stamp - other) for other in right) for stamp in left)
+        # One side may arrive late, and be paired all the same.
+        gap_ns = min(
+            median(min(abs(stamp - other) for other in others) for stamp in list(stamps)[-RECENT:])
+            for stamps, others in ((left, right), (right, left))
+        )
         tolerance_s = self._node.settings.sync_tolerance_s
         if gap_ns > 1e9 * tolerance_s:
             self._node.reporter.diagnose(

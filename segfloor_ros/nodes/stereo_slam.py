@@ -6,7 +6,7 @@ import time
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import Mount, StereoFrame
-from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.errors import InputError, about
 from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE, StereoSlam
 from segfloor_ros.nodes.messages.diagnostics import Level
@@ -196,8 +196,8 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             self._results.report_held(stamp_ns, slam)
         elif results[-1].stamp_ns == stamp_ns and results[-1].tracked:
             self._results.topics.publish_frame(slam.rig_check.corrected(frame))
-        for about, remark in slam.sensors.remarks.items():
-            self.reporter.diagnose(about, remark)
+        for sensor, remark in slam.sensors.remarks.items():
+            self.reporter.diagnose(sensor, remark)
         self._camera.watch.report_faults(slam.rig_check.faults.values())
         if self._results.mount is not None and slam.back_end.idle:
             self._maps.keep(slam)
@@ -223,7 +223,8 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             mount = None if own.gives_mount else self._transforms.mount(frames.left)
             if own.path_only and mount is None and not own.has_mount:
                 mount = CAMERA_AS_BASE
-            self.slam = self._make_slam(camera, mount)
+            with about(f'tf from {own.base_frame} to {frames.left}'):
+                self.slam = self._make_slam(camera, mount)
         self.slam.announce = self._results.announce if self.settings.background else None
         self._results.topics.begin(self._camera.calibration, frames)
         self._sensors.begin(frames.left, self._camera.rectifier.calibration.left.R)
