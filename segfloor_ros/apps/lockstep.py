@@ -359,6 +359,9 @@ class LockstepRun:
                     i: later for i, later in self._unmasked.items() if i > result.index
                 }
         if result.keyframe is not None:
+            moving = result.keyframe.moving
+            if self._save_masks is not SaveMasks.none and moving is not None and moving.any():
+                self._folder.add_picture('moving_masks', f'{result.index:06d}', moving)
             self._path = new_keyframes(result.keyframe.path)
             result = dataclasses.replace(result, keyframe=None)
         if self._results and result.index <= self._results[-1].index:
@@ -381,8 +384,6 @@ class LockstepRun:
         number = f'{keyframe.frame_index:06d}'
         if self._save_masks is not SaveMasks.none:
             self._folder.add_picture('floor_masks', number, floor.mask)
-            if keyframe.moving is not None:
-                self._folder.add_picture('moving_masks', number, keyframe.moving)
         if self._save_debug:
             overlay, histogram = mask_overlay(keyframe.left, floor.mask), v_disparity_picture(floor)
             self._folder.add_picture('floor_debug', f'{number}_overlay', overlay)
