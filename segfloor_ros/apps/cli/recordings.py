@@ -20,6 +20,7 @@ from segfloor_ros.apps.calibration import (
     CalibrationResult,
     calibrate_folder,
     check_recording,
+    convert_calibration,
 )
 from segfloor_ros.apps.cli import printing, terminal
 from segfloor_ros.apps.cli.printing import console
@@ -302,6 +303,18 @@ def calibrate(
             '--square also by the length of a board in view. Status 1: it does not.',
         ),
     ] = None,
+    other: Annotated[
+        Path | None,
+        typer.Option(
+            '--from',
+            metavar='FILE',
+            help='In place of pictures: write the calibration of another tool (ZED, OAK, Basalt, '
+            'ORB-SLAM, OpenCV, Kalibr, ost.txt) as ROS files into --out.',
+        ),
+    ] = None,
+    size: Annotated[
+        str, typer.Option(help='With --from: WIDTHxHEIGHT of the images, where FILE needs it.')
+    ] = '',
     params: terminal.Params = None,
     assignments: terminal.Set = None,
 ) -> None:
@@ -311,7 +324,21 @@ def calibrate(
     segfloor calibrate pictures --square 0.03 --board 9x6
     segfloor calibrate pictures --square 0.03 --board 10x7 --marker 0.022 --dictionary 5X5_100
     segfloor calibrate --check drive.mcap --square 0.03 --board 9x6
+    segfloor calibrate --from SN12345.conf --size 1280x720 --out zed
     """
+    if other is not None:
+        if folder is not None or recording is not None:
+            raise SettingsError('give --from FILE and --out FOLDER alone')
+        given = re.fullmatch('([1-9][0-9]{0,4})x([1-9][0-9]{0,4})', size)
+        if size and given is None:
+            raise SettingsError(f'--size {size}: expected e.g. 1280x720')
+        target = out or Path()
+        made = convert_calibration(
+            other, None if given is None else (int(given[1]), int(given[2])), target
+        )
+        camera = made.camera
+        words = f'{camera.width}x{camera.height}, baseline {camera.baseline_m:.4f} m'
+        return console.print(f'{target}: left.yaml, right.yaml: {words}', soft_wrap=True)
     sides = re.fullmatch('([0-9]{1,2})x([0-9]{1,2})', board)
     if sides is None:
         raise SettingsError(f'--board {board}: expected e.g. 9x6')

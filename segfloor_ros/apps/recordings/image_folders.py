@@ -37,6 +37,7 @@ from segfloor_ros.apps.recordings.files import (
     side_pairs,
     stamps_of_rate,
 )
+from segfloor_ros.apps.recordings.other_calibrations import read_other
 from segfloor_ros.apps.recordings.source import PLAUSIBLE_HZ, StereoSource
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.depth import depth_calibration, disparity_of_depth
@@ -60,6 +61,8 @@ INDEX = 'data.csv'
 SENSOR = 'sensor.yaml'
 
 KITTI_CAMERAS = ((0, 1), (2, 3))
+KITTI_RAW = 'calib_cam_to_cam.txt'
+"""Calibration of a day of KITTI's raw recordings, beside the folders of its drives."""
 
 TUM_UNIT_M = 1 / 5000
 """Depth images of the TUM RGB-D benchmark (Sturm et al., IROS 2012)."""
@@ -102,7 +105,14 @@ def open_image_folders(folder: Path, settings: StereoCameraSettings) -> StereoSo
         for number, (i, j) in enumerate(zip(*places, strict=True))
     ]
     near = (folder, left[0].parent, left[0].parent.parent)
-    calibration = find_calibration(str(folder), near, settings)
+    raw = next((p for p in (folder / KITTI_RAW, folder.parent / KITTI_RAW) if p.is_file()), None)
+    calibration = None if raw is None else given_calibration(settings)
+    if raw is not None and calibration is None:
+        number = left[0].parts[-3].removeprefix('image_')
+        cameras = ('02', '03') if number == '02' else ('00', '01')
+        size = files.first_image_size(left, str(folder))
+        calibration = read_other(raw, size=size, cameras=cameras)
+    calibration = calibration or find_calibration(str(folder), near, settings)
     sensors = folder_sensors(folder, settings.ignored_sensors)
     return files.file_pair_source(str(folder), pairs, calibration, settings.bit_depth, sensors)
 
