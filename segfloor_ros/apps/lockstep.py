@@ -33,7 +33,7 @@ from segfloor_ros.core.contracts import (
     Mount,
     StereoFrame,
 )
-from segfloor_ros.core.errors import MapError, SegfloorError, SettingsError
+from segfloor_ros.core.errors import InputError, MapError, SegfloorError, SettingsError
 from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.files.results import SAVED_MAP, read_map_file, write_map_file
 from segfloor_ros.core.files.writing import check_output
@@ -317,7 +317,7 @@ class LockstepRun:
                 if self._interrupted.is_set():
                     return
         except SegfloorError as error:
-            if not self._frames:
+            if not self._frames or 'no_rig' in self._pipeline.slam.rig_check.faults:
                 raise
             self.broken_off = error
 
@@ -330,6 +330,9 @@ class LockstepRun:
 
     def _say_faults(self) -> None:
         faults = self._pipeline.slam.rig_check.faults
+        if 'no_rig' in faults:
+            name = self._configuration.stereo_camera.input
+            raise InputError(f'{name}: {faults["no_rig"].line()}')
         lines = {name: fault.line() for name, fault in faults.items()}
         lines |= self._pipeline.keyframe_stages.floor.remarks
         for name in sorted(lines.keys() - self._faults_said):

@@ -31,11 +31,14 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
 
     def set_up(self) -> None:
         """Make the topics."""
+        from segfloor_ros.nodes.watches.camera import CameraWatch
+        from segfloor_ros.nodes.watches.tf import RivalWatch
+
         self.slam: StereoSlam | None = None
-        self._transforms = Transforms(self)
+        self._transforms = Transforms(self, RivalWatch(self))
         self.masks = MaskInput(self, self.settings.mask_timeout_s, self._take_late_mask)
         self._work = self.inputs.later(self._process_waiting)
-        self._camera = StereoInput(self, self._work)
+        self._camera = StereoInput(self, self._work, CameraWatch(self))
         self._sensors = SensorInput(self, self._transforms, self._look)
         self._results = SlamResults(self, self._transforms, self._camera.watch)
         self._maps = SlamMaps(self, self._results.topics, lambda: self.slam)

@@ -102,8 +102,10 @@ class _Reader:
         self, size: Size, intrinsics: list[tuple[Array, Array, str]], T_right_left: Array
     ) -> StereoCalibration:
         """Return the pair of two raw cameras: K (3, 3), distortion and model of each."""
-        eyes = (self.eye(size, *one, side) for one, side in zip(intrinsics, SIDES, strict=True))
-        return calibration_from_extrinsics(*eyes, T_right_left)
+        left, right = (
+            self.eye(size, *one, side) for one, side in zip(intrinsics, SIDES, strict=True)
+        )
+        return calibration_from_extrinsics(left, right, T_right_left)
 
 
 SIDES = ('left', 'right')
@@ -255,10 +257,10 @@ def _orb_slam(file: _Reader) -> StereoCalibration:
     for side in sides if file.has('Stereo.T_c1_c2') else (name,):
         K = _K(*(float(file.numbers(f'{side}.{key}', 1)[0]) for key in ('fx', 'fy', 'cx', 'cy')))
         if kind == 'KannalaBrandt8':
-            D, model = terms(side, 'k1', 'k2', 'k3', 'k4'), 'equidistant'
+            lens, model = terms(side, 'k1', 'k2', 'k3', 'k4'), 'equidistant'
         else:
-            D, model = terms(side, 'k1', 'k2', 'p1', 'p2', 'k3'), 'plumb_bob'
-        intrinsics.append((K, np.array(D), model))
+            lens, model = terms(side, 'k1', 'k2', 'p1', 'p2', 'k3'), 'plumb_bob'
+        intrinsics.append((K, np.array(lens), model))
     if len(intrinsics) == 2:
         T_left_right = file.numbers('Stereo.T_c1_c2', 16).reshape(4, 4)
         return file.raw_pair(size, intrinsics, invert(T_left_right))
@@ -318,9 +320,10 @@ def _opencv(file: _Reader) -> StereoCalibration:
 
 def _kitti_raw(file: _Reader) -> StereoCalibration:
     """`calib_cam_to_cam.txt`: of rectified images, unless the size is that of raw ones."""
-    sizes = {
-        tuple(file.numbers(f'S{kind}_00', 2).astype(int).tolist()): kind for kind in ('', '_rect')
-    }
+    sizes: dict[Size, str] = {}
+    for kind in ('', '_rect'):
+        width, height = file.numbers(f'S{kind}_00', 2).astype(int).tolist()
+        sizes[width, height] = kind
     size = file.size or next(size for size, kind in sizes.items() if kind)
     if size not in sizes:
         listed = ' or '.join(f'{width}x{height}' for width, height in sizes)

@@ -145,11 +145,10 @@ class Reporter:
         """Warn about sets that were given up, naming the topics of the missing parts."""
         for dropped in joiner.take_dropped():
             names = ', '.join(dropped.missing)
-            counts = {name: publishing_nodes(name) for name in joiner.parts}
             crowded = ''.join(
                 f'; {name} is published by {count} nodes, stop or remap one'
-                for name, count in counts.items()
-                if count > 1
+                for name in joiner.parts
+                if (count := publishing_nodes(name)) > 1
             )
             text = f'no message on {names} with stamp {dropped.stamp_ns}; dropped{crowded}'
             self.health.count('dropped')
@@ -221,15 +220,11 @@ def offered(node: Node, topics: Iterable[str], **policies: object) -> list[str]:
     """Return the topics that somebody publishes with some policies, e.g. best effort, which reaches
     no reliable listener.
     """
-    wanted = policies.items()
-    return [
-        topic
-        for topic in topics
-        if any(
-            all(getattr(info.qos_profile, name) == policy for name, policy in wanted)
-            for info in node.get_publishers_info_by_topic(topic)
-        )
-    ]
+
+    def offers(info: TopicEndpointInfo) -> bool:
+        return all(getattr(info.qos_profile, name) == one for name, one in policies.items())
+
+    return [t for t in topics if any(map(offers, node.get_publishers_info_by_topic(t)))]
 
 
 def incompatible_topics(

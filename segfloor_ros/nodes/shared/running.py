@@ -155,10 +155,9 @@ def descriptor(spec: SettingSpec) -> ParameterDescriptor:
     """Return the descriptor of a setting. The type stays open, so that the check of the setting
     says what is wrong.
     """
-    unit = f' [{spec.unit}]' if spec.unit else ''
     result = ParameterDescriptor(
         name=spec.name,
-        description=spec.description + unit,
+        description=spec.description + (f' [{spec.unit}]' if spec.unit else ''),
         additional_constraints=spec.range_text(),
         read_only=not spec.live,
         dynamic_typing=True,

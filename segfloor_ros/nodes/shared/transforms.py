@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 
 from segfloor_ros.core.contracts import FrameResult, Mount
 from segfloor_ros.core.geometry import Array, invert
-from segfloor_ros.nodes.messages.diagnostics import Level
 from segfloor_ros.nodes.messages.poses import transform_message
 from segfloor_ros.nodes.messages.topics import IMAGES, PATIENCE_S
 from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
@@ -31,11 +31,13 @@ class Transforms:
     so that whoever looks up map → base_link finds it as fresh as the odometry.
     """
 
-    def __init__(self, node: AnyStageNode) -> None:
+    def __init__(
+        self, node: AnyStageNode, on_heard: Callable[[TransformStamped], None] | None = None
+    ) -> None:
         own: StereoSlamNodeSettings = node.settings
         self._node = node
         self._own = own
-        self._link = TfLink(node, self._find_rival if own.publish_tf else None)
+        self._link = TfLink(node, on_heard)
         self._publishers = 0
         self._tf = self._link.frames
         self._opened_s = self._deadline_s = 0.0
@@ -125,29 +127,6 @@ class Transforms:
         """Broadcast the mount in use where tf lacks it, once tf had its time to tell."""
         self._unsent_mount = stamp_ns, camera_frame, mount
         self._is_announced = True
-
-    def _find_rival(self, found: TransformStamped) -> None:
-        """Report a frame that another node broadcasts, too."""
-        own, parent, child = self._own, found.header.frame_id, found.child_frame_id
-        ours = {own.odom_frame: own.map_frame, own.base_frame: own.odom_frame}
-        if child not in ours or (self._is_fused and child == own.base_frame):
-            return
-        me = self._node.get_name()
-        infos = self._node.get_publishers_info_by_topic('/tf')
-        infos += self._node.get_publishers_info_by_topic('/tf_static')
-        others = sorted({info.node_name for info in infos} - {me})
-        remedy = f'set publish_odom_tf of {me} to false where the other is to own it'
-        if child == own.odom_frame:
-            remedy = f'let one of both localise, or set publish_tf of {me} to false'
-        elif parent != own.odom_frame:
-            remedy = f'set base_frame of {me} to {self._tf.root_of(parent)}'
-        self._node.reporter.diagnose(
-            f'{child} on tf',
-            f'{child} jumps: tf has it below {parent}, by {" or ".join(others)}, and below '
-            f'{ours[child]}, by {me}; {remedy}, or stop the other',
-            Level.ERROR,
-            PATIENCE_S,
-        )
 
     def _advance(self) -> None:
         publishers = self._node.count_publishers('/tf') + self._node.count_publishers('/tf_static')

@@ -70,6 +70,9 @@ no measurement."""
 WHITE_SHARE = 1 / 3
 """Lamps, windows and the sky whiten less."""
 
+NO_RIG_PX = 5.0
+"""Rows between both eyes change by less while a rig is driven, however badly it is rectified."""
+
 NEAREST_M, NEAREST_PERCENT = (0.25, 4.0), 95
 """The nearest twentieth of what a depth camera of a robot measures is farther than it reaches down
 to, and no farther than the floor or the walls around it; other figures have another unit."""
@@ -101,6 +104,13 @@ FAULTS = {
         '%',
         'show different things: {value:.0f}% of the points of one are found in the other',
         'check that both are of one camera, none of them turned, mirrored or of another time',
+    ),
+    'no_rig': (
+        'px',
+        'are of no stereo camera: the same points are {value:.0f} rows further apart in one pair '
+        'than in another',
+        'take two cameras on one rigid mount that are triggered together; two phones or webcams '
+        'side by side are none',
     ),
     'depth_unaligned': (
         'px',
@@ -158,7 +168,7 @@ FAULTS = {
 }
 """Of each fault its unit, what was found, and what to do."""
 
-BENT = {'rows_apart', 'eyes_swapped', 'same_image', 'different_views', 'not_simultaneous'}
+BENT = {'no_rig', 'rows_apart', 'eyes_swapped', 'same_image', 'different_views', 'not_simultaneous'}
 """Images with these faults show a world that is bent, whatever the calibration."""
 
 
@@ -257,6 +267,8 @@ class RigCheck:
 
     def _found_lag(self, lag_s: float, frame_s: float, late: str, early: str) -> None:
         """Note that one kind of image is late, or early where the lag is negative."""
+        if 'not_simultaneous' in self.faults:  # it is said once, and with one figure
+            return
         late, early = (late, early) if lag_s > 0 else (early, late)
         lag_ms, frames = 1e3 * abs(lag_s), abs(lag_s) / frame_s
         self._found(
@@ -316,11 +328,19 @@ class RigCheck:
         return guess._replace(right_px=np.asarray(right_px, np.float32)).those(found)
 
     def _judge(self) -> None:
+        if 'no_rig' in self.faults:
+            return
         seen = np.concatenate(self._looks)
         points = sum(self._points)
         if len(seen) < max(MIN_MATCHES, FOUND_SHARE * points):
             if len(self._looks) == RECENT and min(self._points) >= MIN_MATCHES:
                 self._found('different_views', 100 * len(seen) / points)
+            return
+        if len(self._looks) == RECENT and (change_px := self._change_px()) > NO_RIG_PX:
+            self._mend = None
+            for bent in BENT & self.faults.keys():
+                del self.faults[bent]
+            self._found('no_rig', change_px)
             return
         followed = seen[np.isfinite(seen).all(axis=1)]
         lag_s = self._lag_s(followed)
@@ -368,6 +388,22 @@ class RigCheck:
             self._found('focal_length', too_long, seen_px=factor * fx, given_px=fx)
         if offset_px is not None:
             self._found('principal_points', offset_px)
+
+    def _change_px(self) -> float:
+        """Return by how many rows the distance between both eyes changes from look to look, as far
+        as points of one look agree, without what one lag explains.
+        """
+        enough = [look for look in self._looks if len(look) >= MIN_MATCHES]
+        if len(enough) < RECENT - 1:
+            return 0.0
+        apart = []
+        lag = self._lag_s(np.concatenate([look[np.isfinite(look).all(axis=1)] for look in enough]))
+        for look in enough:
+            rows_px = look[:, 3] - lag * np.nan_to_num(look[:, 5])
+            apart.append((float(np.median(rows_px)), spread_px(rows_px)))
+        middles, spreads = np.array(apart).T
+        change_px = float(np.ptp(middles))
+        return change_px if change_px > SURE * float(np.median(spreads)) else 0.0
 
     def _judge_pictures(self) -> None:
         if len(self._pictures) < RECENT:
