@@ -78,6 +78,7 @@ setup(
             'rich>=13',
             'rosbags>=0.10',
             'mcap>=1.1',
+            'zstandard>=0.19',
             'evo>=1.28',
             'matplotlib>=3.6',
             'junitparser>=3',

@@ -40,14 +40,14 @@ STAGES = ('slam', 'floor', 'cloud', 'grid')
 """Data flows from left to right; what passes between them is in `core.contracts`."""
 
 CEILINGS = {
-    'core.pipeline': 9975,
+    'core.pipeline': 9400,
     'core.slam.stereo_slam': 6050,
     'core.floor.segmentation': 2800,
     'core.cloud': 750,
     'core.grid.mapper': 1400,
-    'nodes.stereo_camera': 3750,
+    'nodes.stereo_camera': 3650,
     'nodes.stereo_slam': 9900,
-    'nodes.floor_segmentation': 5000,
+    'nodes.floor_segmentation': 4900,
     'nodes.cloud_labelling': 3050,
     'nodes.occupancy_grid': 3400,
     'apps.cli.main': 415,

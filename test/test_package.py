@@ -23,7 +23,7 @@ IMPORT_OF_KEY = {'python3-numpy': 'numpy', 'python3-opencv': 'cv2', 'python3-sci
                  'python3-matplotlib': 'matplotlib'}  # fmt: skip
 OF_EXTRAS = {
     'evo', 'rosbags', 'mujoco', 'junitparser', 'fsspec', 'distributed', 'rerun', 'onnxruntime',
-    'mcap',
+    'mcap', 'zstandard',
 }  # fmt: skip
 """What has no key of rosdep: commands that need one of them say so in one line."""
 START_S = 60.0

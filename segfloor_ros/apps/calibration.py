@@ -14,9 +14,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.apps.recordings.calibration_files import ros_calibration
+from segfloor_ros.apps.recordings.calibration_files import (
+    holds_both,
+    read_calibration,
+    ros_calibration,
+)
 from segfloor_ros.apps.recordings.extrinsics import calibration_from_extrinsics
 from segfloor_ros.apps.recordings.image_folders import find_image_pairs
+from segfloor_ros.apps.recordings.other_calibrations import form_of, read_other
 from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.model import StereoCamera
@@ -250,9 +255,7 @@ def calibrate_folder(
             f'needed{left_out and ": "}{left_out}; check what the board is, or take more pictures'
         )
     calibration, rms_px, errors_px = _solve(views, size, board, str(folder))
-    texts = ros_calibration(calibration.left, 'left'), ros_calibration(calibration.right, 'right')
-    for name, text in zip(FILES, texts, strict=True):
-        write_output(target / name, YAML, text.encode())
+    write_calibration(calibration, target)
     rows_px = [_rows_rms_px(calibration, view) for view in views]
     errors_px = np.column_stack([errors_px, rows_px])
     order = np.argsort(-np.linalg.norm(errors_px[:, :2], axis=1), kind='stable')
@@ -260,6 +263,26 @@ def calibrate_folder(
     return CalibrationResult(
         calibration, board, rms_px, views, errors_px[order], left_out, len(left)
     )
+
+
+def write_calibration(calibration: StereoCalibration, folder: Path) -> None:
+    """Write left.yaml and right.yaml. Raises InputError."""
+    for name, eye in zip(FILES, (calibration.left, calibration.right), strict=True):
+        text = ros_calibration(eye, name.removesuffix('.yaml'))
+        write_output(folder / name, YAML, text.encode())
+
+
+def convert_calibration(file: Path, size: tuple[int, int] | None, out: Path) -> StereoCalibration:
+    """Write the calibration that another tool has put into one file as left.yaml and right.yaml.
+    size: (width, height) of the images, where the file does not say it. Raises InputError or
+    CalibrationError.
+    """
+    for name in FILES:
+        check_output(out / name, YAML, [file])
+    is_other = form_of(file) is not None or not holds_both(file)
+    calibration = read_other(file, size=size) if is_other else read_calibration(file, file)
+    write_calibration(calibration, out)
+    return calibration
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from segfloor_ros.core.contracts import (
     Mount,
     StereoFrame,
 )
-from segfloor_ros.core.errors import MapError, SegfloorError, SettingsError
+from segfloor_ros.core.errors import InputError, MapError, SegfloorError, SettingsError
 from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.files.results import SAVED_MAP, read_map_file, write_map_file
 from segfloor_ros.core.files.writing import check_output
@@ -317,7 +317,7 @@ class LockstepRun:
                 if self._interrupted.is_set():
                     return
         except SegfloorError as error:
-            if not self._frames:
+            if not self._frames or 'no_rig' in self._pipeline.slam.rig_check.faults:
                 raise
             self.broken_off = error
 
@@ -330,6 +330,9 @@ class LockstepRun:
 
     def _say_faults(self) -> None:
         faults = self._pipeline.slam.rig_check.faults
+        if 'no_rig' in faults:
+            name = self._configuration.stereo_camera.input
+            raise InputError(f'{name}: {faults["no_rig"].line()}')
         lines = {name: fault.line() for name, fault in faults.items()}
         lines |= self._pipeline.keyframe_stages.floor.remarks
         for name in sorted(lines.keys() - self._faults_said):
@@ -359,6 +362,9 @@ class LockstepRun:
                     i: later for i, later in self._unmasked.items() if i > result.index
                 }
         if result.keyframe is not None:
+            moving = result.keyframe.moving
+            if self._save_masks is not SaveMasks.none and moving is not None and moving.any():
+                self._folder.add_picture('moving_masks', f'{result.index:06d}', moving)
             self._path = new_keyframes(result.keyframe.path)
             result = dataclasses.replace(result, keyframe=None)
         if self._results and result.index <= self._results[-1].index:
@@ -381,8 +387,6 @@ class LockstepRun:
         number = f'{keyframe.frame_index:06d}'
         if self._save_masks is not SaveMasks.none:
             self._folder.add_picture('floor_masks', number, floor.mask)
-            if keyframe.moving is not None:
-                self._folder.add_picture('moving_masks', number, keyframe.moving)
         if self._save_debug:
             overlay, histogram = mask_overlay(keyframe.left, floor.mask), v_disparity_picture(floor)
             self._folder.add_picture('floor_debug', f'{number}_overlay', overlay)

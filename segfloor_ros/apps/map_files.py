@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,17 @@ from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.images import read_picture
 from segfloor_ros.core.grid.occupancy import (
     FREE,
+    FREE_PIXEL,
     FREE_THRESH,
     OCCUPIED,
     OCCUPIED_THRESH,
     UNKNOWN,
+    UNKNOWN_PIXEL,
     OccupancyGrid,
 )
 from segfloor_ros.nodes.yaml_files import read_yaml
+
+logger = logging.getLogger(__name__)
 
 MODES = ('trinary', 'scale', 'raw')
 
@@ -32,9 +37,50 @@ def load_map(path: Path) -> OccupancyGrid:
     description = _read_description(path)
     image_path = path.parent / description['image']
     grey, opaque = _grey_and_opaque(read_picture(image_path))
+    opaque |= description['mode'] != 'scale'
+    if description['mode'] == 'trinary' and not description['negate']:
+        is_unknown = _unknown_by_its_saver(grey, description['free_thresh'])
+        if is_unknown.any():
+            logger.warning(
+                '%s: free_thresh = %g takes the grey level %d, which savers of maps write where '
+                'nothing is known, for free; these %d cells are taken for unknown; correct it to '
+                'free_thresh: %g, or Nav2 drives there', path, description['free_thresh'],
+                UNKNOWN_PIXEL, np.count_nonzero(is_unknown), FREE_THRESH,
+            )  # fmt: skip
+        opaque &= ~is_unknown
     cells = _cells(grey, opaque, description)
     x, y, _ = description['origin']
     return OccupancyGrid(np.ascontiguousarray(cells[::-1]), description['resolution'], (x, y))
+
+
+def is_map(path: Path) -> bool:
+    """Whether a file looks like the YAML of a map."""
+    if path.suffix not in ('.yaml', '.yml') or not path.is_file():
+        return False
+    text = path.read_bytes()[:4096].decode(errors='replace')
+    return all(f'{key}:' in text for key in ('image', 'resolution', 'origin'))
+
+
+def map_facts(grid: OccupancyGrid) -> dict[str, Any]:
+    """Return areas in m² and the size of what is known in m, by name."""
+    known = np.nonzero(grid.cells != UNKNOWN)[::-1]
+    return {
+        'free_m2': round(grid.area_m2(grid.states == FREE), 2),
+        'occupied_m2': round(grid.area_m2(grid.states == OCCUPIED), 2),
+        'size_m': [
+            round(float(np.ptp(one) + 1) * grid.resolution_m, 2) if len(one) else 0.0
+            for one in known
+        ],
+    }
+
+
+def _unknown_by_its_saver(grey: NDArray[np.float64], free_thresh: float) -> NDArray[np.bool_]:
+    """Return the pixels (H, W) that a saver of mode trinary wrote for unknown, though a reader by
+    the letter takes them for free: as grey as they are, beside others that are free for certain.
+    """
+    is_free = 1 - grey / 255 < free_thresh
+    unknown = is_free & (grey == UNKNOWN_PIXEL)
+    return unknown if (is_free & (grey >= FREE_PIXEL)).any() else np.zeros_like(unknown)
 
 
 def _read_description(path: Path) -> dict[str, Any]:
@@ -94,6 +140,4 @@ def _cells(
     if values['mode'] == 'scale':
         between = np.where(opaque, np.rint((occupancy - low) / (high - low) * 100), UNKNOWN)
     cells = np.where(occupancy < low, FREE, np.where(occupancy > high, OCCUPIED, between))
-    if values['mode'] == 'scale':
-        cells = np.where(opaque, cells, UNKNOWN)
-    return cells.astype(np.int8)
+    return np.where(opaque, cells, UNKNOWN).astype(np.int8)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.contracts import KeyframePath
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.files.whole import read_table
+from segfloor_ros.core.files.whole import digits_of, read_lines, read_table
 from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.quaternions import quaternion_xyzw, rotations_of
 
@@ -94,12 +94,14 @@ def write_tum(path: Path, trajectory: Trajectory, comments: Iterable[str] = ()) 
 
 
 def read_trajectory(path: Path) -> tuple[Array, Array]:
-    """Return times (N,) in seconds and poses (N, 4, 4) of a TUM or KITTI file.
+    """Return times (N,) in seconds and poses (N, 4, 4) of a TUM or KITTI file, whose times may have
+    another unit (`digits_of`).
 
     KITTI poses take their times from times.txt in the same folder. Raises InputError.
     """
     table = read_table(path)
     if table.shape[1] == len(TUM_COLUMNS):
+        table[:, 0] /= _units_in_a_second(path)
         return _checked(*_from_tum(table, path), path)
     if table.shape[1] == 3 * 4:
         return _checked(_times_beside(path, len(table)), _from_kitti(table, path), path)
@@ -107,6 +109,10 @@ def read_trajectory(path: Path) -> tuple[Array, Array]:
         f'{path}: has {table.shape[1]} columns; a TUM trajectory has 8 (t x y z qx qy qz qw), '
         'KITTI poses have 12'
     )
+
+
+def _units_in_a_second(path: Path) -> float:
+    return 10.0 ** digits_of((line.split()[0] for _, line in read_lines(path)), str(path))
 
 
 def _checked(times: Array, poses: Array, path: Path) -> tuple[Array, Array]:
@@ -142,7 +148,7 @@ def _from_kitti(table: Array, path: Path) -> Array:
 
 def _times_beside(path: Path, count: int) -> Array:
     file = path.parent / 'times.txt'
-    times = read_table(file)[:, 0]
+    times = read_table(file)[:, 0] / _units_in_a_second(file)
     if len(times) < count:
         raise InputError(f'{file}: has {len(times)} times for {count} poses in {path.name}')
     return times[:count]

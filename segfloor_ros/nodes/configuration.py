@@ -7,8 +7,10 @@ nodes are the settings of their stages, and what only nodes have: frames, rates,
 
 from __future__ import annotations
 
+import re
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +87,45 @@ def read_params_file(path: Path) -> dict[str, dict[str, Any]]:
         parameters = {k: v for k, v in parameters.items() if k not in ROS_PARAMETERS}
         merge(values, _by_stage(str(node), parameters, path))
     return values
+
+
+def unread_sections(arguments: Sequence[str], full_name: str) -> list[str]:
+    """Return a line for each section in the parameter files of a command line that is meant for a
+    node, by the last word of its name, but that ROS does not give to it. full_name: of the node.
+    """
+    files = [Path(file) for word, file in pairwise(arguments) if word == '--params-file']
+    lines = []
+    for file in files:
+        try:
+            sections = list(_sections(read_yaml(file, 'names of nodes', SettingsError), ''))
+        except SettingsError:
+            continue  # what ROS makes of it, it says
+        name = full_name.rpartition('/')[2]
+        near = [s for s in sections if s.rpartition('/')[2] == name and not _is_for(s, full_name)]
+        if near and not any(_is_for(s, full_name) for s in sections if not s.endswith('*')):
+            lines.append(
+                f'{file} has parameters of {near[0].lstrip("/")}, but this node is {full_name}: '
+                f'they are not read; name the section {full_name}, or /**/{name} for any namespace'
+            )
+    return lines
+
+
+def _sections(document: Mapping[str, Any], above: str) -> Iterator[str]:
+    """Yield the full names of the nodes in a parameter file, which may lie in one another."""
+    for key, content in document.items():
+        name = f'{above}/{key.strip("/")}'
+        if isinstance(content, dict):
+            if 'ros__parameters' in content:
+                yield name
+            others = {k: v for k, v in content.items() if k != 'ros__parameters'}
+            yield from _sections(others, name)
+
+
+def _is_for(section: str, full_name: str) -> bool:
+    """Whether ROS gives a section to a node; `*` is one word of its name and `**` any number."""
+    words = {'**': '(/[^/]+)*', '*': '/[^/]+'}
+    pattern = ''.join(words.get(w, f'/{re.escape(w)}') for w in section.split('/')[1:])
+    return re.fullmatch(pattern, full_name) is not None
 
 
 def _by_stage(node: str, parameters: dict[str, Any], path: Path) -> dict[str, dict[str, Any]]:

@@ -9,9 +9,9 @@ import numpy as np
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.calibration import StereoCalibration, eye_calibration
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import Mount
+from segfloor_ros.core.errors import about
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART
 from segfloor_ros.nodes.messages.images import (
@@ -148,8 +148,8 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         said = grey8_image(parts[SEMANTIC_MASK], SEMANTIC_MASK) if SEMANTIC_MASK in parts else None
         floor = stage.process(left, right, self.mount, T_map_base, moving, said)
         remarks = stage.remarks
-        for about, words in remarks.items():
-            self.reporter.diagnose(about, words, lasts_s=float('inf'))
+        for what, words in remarks.items():
+            self.reporter.diagnose(what, words, lasts_s=float('inf'))
         out, at = self.outputs, (stamp_ns, frame_id)
         out.publish('keyframe/floor_mask', image_message(*at, floor.mask))
         scan = scan_message(stamp_ns, self._base_frame, floor.scan)
@@ -186,8 +186,11 @@ def _stereo(
 ) -> tuple[StereoCamera, NDArray[np.uint8], NDArray[Any]]:
     """Return camera and rectified images. topics: left image and calibration, then the right."""
     left, left_info, right, right_info = topics
-    eyes = (eye_calibration(parts[topic], topic) for topic in (left_info, right_info))
-    camera = StereoCalibration(*eyes).camera
+    P, right_P = parts[left_info].p, parts[right_info].p
+    size = parts[left_info].width, parts[left_info].height
+    baseline_m = -right_P[3] / right_P[0] if right_P[0] else 0.0
+    with about(f'{left_info}, {right_info}'):
+        camera = StereoCamera(*size, P[0], P[5], P[2], P[6], baseline_m)
     return camera, grey8_image(parts[left], left), right_image(parts[right], right)
 
 

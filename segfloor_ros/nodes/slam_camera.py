@@ -4,39 +4,35 @@ its driver publishes, and what is wrong with either, in words.
 
 from __future__ import annotations
 
-import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from statistics import median
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import CameraInfo
 
-from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration, eye_calibration
+from segfloor_ros.core.camera.calibration import StereoCalibration
+from segfloor_ros.core.camera.camera_info import eye_calibration
 from segfloor_ros.core.camera.depth import depth_calibration, disparity_of_depth
 from segfloor_ros.core.camera.images import EightBitScale, depth_image, grey_image
 from segfloor_ros.core.camera.rectification import StereoRectifier
 from segfloor_ros.core.contracts import InputFault, Mount
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.nodes.messages.camera_infos import same_calibration
-from segfloor_ros.nodes.messages.diagnostics import LASTS_S, RECENT, Level
-from segfloor_ros.nodes.messages.topics import IMAGES, KEYFRAMES, PATIENCE_S, best_effort
+from segfloor_ros.nodes.messages.topics import IMAGES, KEYFRAMES, LATCHED, PATIENCE_S, best_effort
 from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import DISCOVERY_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 
 CATCH_UP = 0.2
 """Of so many of the pairs kept one is skipped per pair processed, where there is no other way."""
-
-FIRST_INFO_S = 5.0
-"""A driver that starts publishes its calibration by then."""
 
 INFOS = ('left/camera_info', 'right/camera_info')
 
@@ -48,8 +44,30 @@ Pair = dict[str, Any]
 
 StampedPair = tuple[int, Pair]
 
-PLAUSIBLE_ROLL_DEG, PLAUSIBLE_PITCH_DEG = 20.0, 60.0
-"""Beyond these a mount that was measured is hard to believe."""
+
+class Watch(Protocol):
+    """Finds over time what is wrong with a camera, and says it (`watches.camera`)."""
+
+    def expect(self, left: str, right: str) -> None:
+        """Watch these two topics from now on."""
+
+    def saw_image(self, topic: str, stamp_ns: int) -> None:
+        """Note an image."""
+
+    def note_taken(self) -> None:
+        """Note that a pair is tracked."""
+
+    def report_skipped(self, stamp_ns: int, is_ready: bool) -> None:
+        """Report a pair that newer ones had overtaken. is_ready: tracking has begun."""
+
+    def find_problems(self, missing_infos: list[str]) -> None:
+        """Diagnose what shows over time. missing_infos: calibrations that images wait for."""
+
+    def report_faults(self, faults: Iterable[InputFault]) -> None:
+        """Diagnose what was found in the images."""
+
+    def judge_measured(self, mount: Mount) -> None:
+        """Say so where the mount that was measured from the floor is hard to believe."""
 
 
 class PairQueue(deque[StampedPair]):
@@ -111,14 +129,14 @@ class StereoInput:
     processed, and rectifies them. on_news: called when a pair or a calibration has come.
     """
 
-    def __init__(self, node: AnyStageNode, on_news: Callable[[], None]) -> None:
+    def __init__(self, node: AnyStageNode, on_news: Callable[[], None], watch: Watch) -> None:
         own: StereoSlamNodeSettings = node.settings
         self._node = node
         self._own = own
         self._on_news = on_news
         self.pairs = PairQueue()
         self._infos: dict[str, CameraInfo] = {}
-        self._eyes: dict[str, EyeCalibration] = {}
+        self._latched: set[str] = set()
         self._takes_best_effort = own.image_reliability == 'best_effort'
         self._kinds = [
             kind
@@ -126,12 +144,13 @@ class StereoInput:
             if own.image_kind in ('auto', kind.image)
             and own.image_transport in ('auto', kind.transport)
         ]
-        self.watch = CameraWatch(node)
+        self.watch = watch
         self.reset()
         self._choose(self._kinds[0])
         for info in INFOS:
             take, is_wanted = partial(self._take_info, info), partial(self._needs, info)
-            node.inputs.subscribe(info, take, self._choose_profile, is_wanted, takes_all=True)
+            choose = partial(self._choose_profile, info)
+            node.inputs.subscribe(info, take, choose, is_wanted, takes_all=True)
         # What waits for a partner, and a whole queue that is taken at once, find room.
         for kind in self._kinds:
             node.inputs.join(
@@ -173,7 +192,7 @@ class StereoInput:
     @property
     def missing_calibrations(self) -> list[str]:
         """The topics on which no calibration has come."""
-        return [topic for topic in self._infos_needed if topic not in self._eyes]
+        return [topic for topic in self._infos_needed if topic not in self._infos]
 
     @property
     def _infos_needed(self) -> tuple[str, ...]:
@@ -188,8 +207,7 @@ class StereoInput:
     def rectifier(self) -> StereoRectifier:
         """What rectifies, made for the calibration at the first pair."""
         if self._rectifier is None:
-            taken = self.calibration if self._is_rectified else self._raw_calibration()
-            self._rectifier = StereoRectifier(taken)
+            self._rectifier = StereoRectifier(self._raw_calibration())
         return self._rectifier
 
     def images(self, pair: Pair) -> tuple[NDArray[np.uint8], NDArray[Any]]:
@@ -244,191 +262,54 @@ class StereoInput:
         topics = (kind.left, kind.right)
         return all(self._node.get_publishers_info_by_topic(topic) for topic in topics)
 
-    def adapt_reliability(self) -> None:
+    def adapt_to_offers(self) -> None:
         """Take the images best effort where a driver offers no more, if the choice is left to the
-        node.
+        node, and a calibration that was published once, before.
         """
-        if self._takes_best_effort or self._own.image_reliability != 'auto':
-            return
-        lossy = offered_best_effort(self._node, (*self._infos_needed, self.left, self.right))
-        if lossy:
-            self._takes_best_effort = True
-            names = ', '.join(lossy)
-            self._node.get_logger().info(
-                f'receives best effort, as offered: {names}; images may get lost'
-            )
-            self._node.inputs.reopen()
+        node, reopens = self._node, False
+        if not self._takes_best_effort and self._own.image_reliability == 'auto':
+            topics = (*self._infos_needed, self.left, self.right)
+            lossy = offered(node, topics, reliability=ReliabilityPolicy.BEST_EFFORT)
+            if lossy:
+                self._takes_best_effort = reopens = True
+                node.get_logger().info(
+                    f'receives best effort, as offered: {", ".join(lossy)}; images may get lost'
+                )
+        missing = {*self.missing_calibrations} - self._latched
+        if latched := offered(node, missing, durability=DurabilityPolicy.TRANSIENT_LOCAL):
+            self._latched.update(latched)
+            reopens = True
+        if reopens:
+            node.inputs.reopen()
 
-    def _choose_profile(self) -> QoSProfile:
+    def _choose_profile(self, topic: str = '') -> QoSProfile:
+        if topic in self._latched:
+            return LATCHED
         return best_effort(IMAGES) if self._takes_best_effort else IMAGES
 
     def _raw_calibration(self) -> StereoCalibration:
-        if self._kind.is_depth:
-            eye = self._eyes[INFOS[0]]
-            if self._is_rectified:
-                eye = EyeCalibration.of_rectified(eye.width, eye.height, eye.P, eye.origin)
-            return depth_calibration(eye)
-        return StereoCalibration(*(self._eyes[topic] for topic in INFOS))
+        """Return the calibration of the images as they come. Raises CalibrationError."""
+        eyes = [eye_calibration(self._infos[t], t, self._is_rectified) for t in self._infos_needed]
+        return depth_calibration(eyes[0]) if self._kind.is_depth else StereoCalibration(*eyes)
 
     def _take_info(self, topic: str, message: CameraInfo) -> None:
         if topic in self._infos and same_calibration(message, self._infos[topic]):
             return
-        self._eyes[topic] = eye_calibration(message, topic)
         self._infos[topic] = message
+        is_rectified = self._is_rectified or not self._is_published(self._kind)
+        eye_calibration(message, topic, is_rectified)
         if self._rectifier is not None:
             text = f'{topic}: the calibration is not the one in use; ~/reset takes it over'
             self._node.reporter.diagnose(f'calibration on {topic}', text, lasts_s=PATIENCE_S)
         self._on_news()
 
 
-class CameraWatch:
-    """Notices unsynchronised and missing images, missing calibrations, and an implausible
-    floor, and says what is wrong in the images.
+def offered(node: Node, topics: Iterable[str], **policies: object) -> list[str]:
+    """Return the topics that somebody publishes with some policies, e.g. best effort, which reaches
+    no reliable listener.
     """
 
-    def __init__(self, node: AnyStageNode) -> None:
-        self._node = node
-        self._missing_s: dict[str, float] = {}
+    def offers(info: TopicEndpointInfo) -> bool:
+        return all(getattr(info.qos_profile, name) == one for name, one in policies.items())
 
-    def expect(self, left: str, right: str) -> None:
-        """Watch these two topics from now on."""
-        self._stamps: dict[str, deque[int]] = {t: deque(maxlen=RECENT) for t in (left, right)}
-        self._last_image_s: dict[str, float] = {}
-        self._taken: deque[bool] = deque(maxlen=RECENT)
-        self._is_live = False
-
-    def saw_image(self, topic: str, stamp_ns: int) -> None:
-        """Note an image."""
-        self._stamps[topic].append(stamp_ns)
-        now_ns = self._node.get_clock().now().nanoseconds
-        self._last_image_s[topic] = 1e-9 * now_ns
-        self._is_live = abs(now_ns - stamp_ns) < 1e9 * PATIENCE_S
-
-    def note_taken(self) -> None:
-        """Note that a pair is tracked."""
-        self._taken.append(True)
-
-    def report_skipped(self, stamp_ns: int, is_ready: bool) -> None:
-        """Report a pair that was left out because newer ones had overtaken it. is_ready: tracking
-        has begun.
-        """
-        reporter = self._node.reporter
-        reporter.health.count('skipped')
-        if not is_ready:
-            words = 'skipped: calibration or mount of the camera are not known yet'
-            reporter.report(stamp_ns, Level.WARN, words)
-            return
-        reporter.report(stamp_ns, Level.WARN, 'skipped: tracking is slower than the camera')
-        self._taken.append(False)
-        topic, stamps_ns = next(iter(self._stamps.items()))
-        rate_hz = (len(stamps_ns) - 1) / max(1e-9 * (stamps_ns[-1] - stamps_ns[0]), 1e-3)
-        reporter.diagnose(
-            'skipped',
-            f'{topic} comes faster than it is tracked: {rate_hz * np.mean(self._taken):.0f} of '
-            f'{rate_hz:.0f} images a second; the others are skipped; lower the rate or the size '
-            'of the images or num_features of stereo_slam, or play a recording with lossless set '
-            'on stereo_camera',
-            lasts_s=PATIENCE_S,
-        )
-
-    def find_problems(self, missing_infos: list[str]) -> None:
-        """Diagnose what shows over time. missing_infos: calibrations that images wait for."""
-        now_s = time.monotonic()
-        self._missing_s = {topic: self._missing_s.get(topic, now_s) for topic in missing_infos}
-        for topic in missing_infos:
-            if now_s - self._missing_s[topic] < FIRST_INFO_S:
-                continue
-            self._node.reporter.diagnose(
-                topic,
-                f'no message on {topic}: images wait for their calibration; let the driver '
-                'publish it, or remap the topic; `segfloor calibrate` makes one',
-                Level.ERROR,
-            )
-        self._find_silence()
-        self._find_unstamped()
-        self._find_mono()
-        self._find_different_stamps()
-
-    def report_faults(self, faults: Iterable[InputFault]) -> None:
-        """Diagnose what was found in the images."""
-        for fault in faults:
-            text = fault.line(' and '.join(self._stamps))
-            self._node.reporter.diagnose(fault.fault, text, Level.ERROR, PATIENCE_S)
-
-    def judge_measured(self, mount: Mount) -> None:
-        """Say so where the mount that was measured from the floor is hard to believe."""
-        pitch, roll = math.degrees(mount.pitch_rad), math.degrees(mount.roll_rad)
-        if abs(roll) > PLAUSIBLE_ROLL_DEG or abs(pitch) > PLAUSIBLE_PITCH_DEG:
-            self._node.reporter.diagnose(
-                'tilt',
-                f'{next(iter(self._stamps))}: the floor seems tilted by {pitch:.1f} deg along and '
-                f'{roll:.1f} deg across the view, which is hardly so; does the camera see the '
-                'floor? else give camera_height_m, camera_pitch_rad and camera_roll_rad',
-                lasts_s=math.inf,
-            )
-
-    def _find_silence(self) -> None:
-        now_s = 1e-9 * self._node.get_clock().now().nanoseconds
-        for topic, last_s in self._last_image_s.items():
-            # A recording may end or wait for the nodes; a camera may not. The time of one that has
-            # ended stands still.
-            if self._is_live and now_s - last_s > LASTS_S:
-                self._node.reporter.diagnose(
-                    f'silence of {topic}',
-                    f'no image on {topic} for a while; is the camera connected and its driver '
-                    'running?',
-                    Level.ERROR,
-                )
-
-    def _find_unstamped(self) -> None:
-        for topic, stamps in self._stamps.items():
-            if len(stamps) == RECENT and not any(stamps):
-                self._node.reporter.diagnose(
-                    f'stamps of {topic}',
-                    f'all stamps on {topic} are zero: no pair can be tracked; let the driver '
-                    'stamp its images',
-                    Level.ERROR,
-                )
-
-    def _find_mono(self) -> None:
-        """Decline one camera alone."""
-        left, right = self._stamps
-        if len(self._stamps[left]) < RECENT or self._stamps[right]:
-            return
-        if not self._node.get_publishers_info_by_topic(right):
-            self._node.reporter.diagnose(
-                'one camera',
-                f'images come on {left}, but nobody publishes {right}: one camera alone does not '
-                'tell how far away anything is; publish or remap right or depth images',
-                Level.ERROR,
-            )
-
-    def _find_different_stamps(self) -> None:
-        left, right = self._stamps.values()
-        now_s = 1e-9 * self._node.get_clock().now().nanoseconds
-        both_come = all(now_s - last_s < 1.0 for last_s in self._last_image_s.values())
-        if not both_come or len(left) < RECENT or len(right) < RECENT:
-            return
-        gap_ns = median(min(abs(stamp - other) for other in right) for stamp in left)
-        tolerance_s = self._node.settings.sync_tolerance_s
-        if gap_ns > 1e9 * tolerance_s:
-            self._node.reporter.diagnose(
-                'stamps',
-                f'the stamps of {" and ".join(self._stamps)} are {1e-6 * gap_ns:.1f} ms apart, '
-                f'more than sync_tolerance_s = {tolerance_s:g} s: no pairs; trigger '
-                'both cameras together, or allow more',
-                Level.ERROR,
-            )
-
-
-def offered_best_effort(node: Node, topics: Iterable[str]) -> list[str]:
-    """Return the topics that somebody publishes best effort, which reaches no reliable listener."""
-    lossy = ReliabilityPolicy.BEST_EFFORT
-    return [
-        topic
-        for topic in topics
-        if any(
-            info.qos_profile.reliability == lossy
-            for info in node.get_publishers_info_by_topic(topic)
-        )
-    ]
+    return [t for t in topics if any(map(offers, node.get_publishers_info_by_topic(t)))]

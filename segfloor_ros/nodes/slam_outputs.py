@@ -52,7 +52,7 @@ from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import LEAST_PERIOD_S, LOOK_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
-from segfloor_ros.nodes.slam_camera import CameraWatch
+from segfloor_ros.nodes.slam_camera import Watch
 
 MAPPING_SUBMAP = 'lost; maps a submap until it recognises a place of the map'
 
@@ -225,7 +225,7 @@ class SlamResults:
     others need time to take each of them.
     """
 
-    def __init__(self, node: AnyStageNode, transforms: Transforms, watch: CameraWatch) -> None:
+    def __init__(self, node: AnyStageNode, transforms: Transforms, watch: Watch) -> None:
         self.topics = SlamTopics(node)
         self._node = node
         self._transforms = transforms

@@ -14,7 +14,7 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image, Imu
 
 from segfloor_ros.core.camera.measurements import (
@@ -42,7 +42,7 @@ from segfloor_ros.nodes.messages.topics import (
 from segfloor_ros.nodes.shared.inputs import DISCOVERY_S, LOOK_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
-from segfloor_ros.nodes.slam_camera import offered_best_effort
+from segfloor_ros.nodes.slam_camera import offered
 
 WHEELS, IMU, TF_WHEELS = 'wheel_odometry', 'imu', 'odom → base_link'
 MASKS, INITIAL_POSE = 'dynamic_mask', 'initialpose'
@@ -97,7 +97,8 @@ class SensorInput:
 
     def adapt_reliability(self) -> None:
         """Receive best effort where a driver offers no more."""
-        if not self._takes_best_effort and offered_best_effort(self._node, (WHEELS, IMU)):
+        lossy = offered(self._node, (WHEELS, IMU), reliability=ReliabilityPolicy.BEST_EFFORT)
+        if lossy and not self._takes_best_effort:
             self._takes_best_effort = True
             self._node.inputs.reopen()
 

@@ -48,7 +48,7 @@ from segfloor_ros.nodes.settings.camera import StereoCameraNodeSettings
 from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import LOOK_S
 from segfloor_ros.nodes.shared.stage_node import StageNode
-from segfloor_ros.nodes.shared.transforms import TfLink
+from segfloor_ros.nodes.shared.tf_link import TfLink
 
 WAITING = 'waiting'
 

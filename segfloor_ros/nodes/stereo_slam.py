@@ -6,7 +6,7 @@ import time
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import Mount, StereoFrame
-from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.errors import InputError, about
 from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE, StereoSlam
 from segfloor_ros.nodes.messages.diagnostics import Level
@@ -31,11 +31,14 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
 
     def set_up(self) -> None:
         """Make the topics."""
+        from segfloor_ros.nodes.watches.camera import CameraWatch
+        from segfloor_ros.nodes.watches.tf import RivalWatch
+
         self.slam: StereoSlam | None = None
-        self._transforms = Transforms(self)
+        self._transforms = Transforms(self, RivalWatch(self))
         self.masks = MaskInput(self, self.settings.mask_timeout_s, self._take_late_mask)
         self._work = self.inputs.later(self._process_waiting)
-        self._camera = StereoInput(self, self._work)
+        self._camera = StereoInput(self, self._work, CameraWatch(self))
         self._sensors = SensorInput(self, self._transforms, self._look)
         self._results = SlamResults(self, self._transforms, self._camera.watch)
         self._maps = SlamMaps(self, self._results.topics, lambda: self.slam)
@@ -100,7 +103,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
 
     def find_problems(self) -> None:
         """Follow what the driver offers, and report what is wrong with the camera."""
-        self._camera.adapt_reliability()
+        self._camera.adapt_to_offers()
         self._sensors.adapt_reliability()
         missing = self._camera.missing_calibrations if self._camera.pairs else []
         self._camera.watch.find_problems(missing)
@@ -197,8 +200,8 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         elif results[-1].stamp_ns == stamp_ns and results[-1].tracked:
             is_idle = not self._camera.pairs
             self._results.topics.publish_frame(slam.rig_check.corrected(frame), is_idle)
-        for about, remark in slam.sensors.remarks.items():
-            self.reporter.diagnose(about, remark)
+        for sensor, remark in slam.sensors.remarks.items():
+            self.reporter.diagnose(sensor, remark)
         self._camera.watch.report_faults(slam.rig_check.faults.values())
         if self._results.mount is not None and slam.back_end.idle:
             self._maps.keep(slam)
@@ -224,7 +227,8 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             mount = None if own.gives_mount else self._transforms.mount(frames.left)
             if own.path_only and mount is None and not own.has_mount:
                 mount = CAMERA_AS_BASE
-            self.slam = self._make_slam(camera, mount)
+            with about(f'tf from {own.base_frame} to {frames.left}'):
+                self.slam = self._make_slam(camera, mount)
         self.slam.announce = self._results.announce if self.settings.background else None
         self._results.topics.begin(self._camera.calibration, frames)
         self._sensors.begin(frames.left, self._camera.rectifier.calibration.left.R)

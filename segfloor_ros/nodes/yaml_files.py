@@ -52,7 +52,9 @@ def read_marked_yaml(path: Path, error_type: type[SegfloorError] = InputError) -
     malformed.
     """
     # OpenCV and EuRoC files begin with `%YAML:1.0`, which is not a directive YAML knows.
+    # Their matrices have a tag of their own, and names of ORB-SLAM have no blank behind the colon.
     text = re.sub('(?m)^%YAML:', '#', read_text(path, error_type, MAX_YAML_BYTES))
+    text = text.replace('!!opencv-matrix', '')
     lines: dict[Key, int] = {}
     try:
         return MarkedYaml(path, _parsed(text, lines), lines, error_type)

@@ -25,8 +25,8 @@ from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectif
 from segfloor_ros.nodes.messages.diagnostics import HEALTH, Health, Level
 from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.topics import IMAGES, TOPICS, best_effort
-from segfloor_ros.nodes.slam_camera import FIRST_INFO_S
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
+from segfloor_ros.nodes.watches.camera import FIRST_INFO_S
 
 CALIBRATION = rectified_calibration(CAMERA)
 GIVEN = (

@@ -28,7 +28,7 @@ from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.stereo_camera import make_stereo_camera
-from segfloor_ros.core.camera.calibration import eye_calibration
+from segfloor_ros.core.camera.camera_info import eye_calibration
 from segfloor_ros.core.cloud import CloudLabelling, CloudLabellingSettings
 from segfloor_ros.core.contracts import (
     POINT_FLOOR,

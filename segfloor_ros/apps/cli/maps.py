@@ -19,6 +19,7 @@ from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.apps.cli.terminal import Json, print_json, value_table
 from segfloor_ros.apps.evaluation.maps import resample
 from segfloor_ros.apps.label_files import draw_labels, filter_mask, save_labels
+from segfloor_ros.apps.map_files import is_map, load_map, map_facts
 from segfloor_ros.core.contracts import KeyframePath, SparseCloud
 from segfloor_ros.core.errors import InputError, MapError, SettingsError
 from segfloor_ros.core.files.arrays import Arrays, MapFile
@@ -32,7 +33,6 @@ from segfloor_ros.core.grid.mapper import OccupancyGridMapper
 from segfloor_ros.core.grid.occupancy import (
     FREE,
     OCCUPIED,
-    UNKNOWN,
     OccupancyGrid,
     OccupancyGridSettings,
     enlarged,
@@ -68,15 +68,20 @@ APPEARED_BGR, GONE_BGR = MASK_COLOURS['not floor'], MASK_COLOURS['floor']
 
 @app.command('info')
 def info(
-    path: Annotated[Path, typer.Argument(metavar='FILE', help='File of --save-map.')],
+    path: Annotated[Path, typer.Argument(metavar='FILE', help='File of --save-map, or map.yaml.')],
     as_json: Json = False,
 ) -> None:
-    """Say what a saved map holds: drives with dates, keyframes, areas, camera.
+    """Say what a saved map holds: drives with dates, keyframes, areas, camera; of a map.yaml size,
+    areas and resolution.
 
     \b
     segfloor map info building.map
     """
-    facts = open_map(path).facts() | {'file_mb': round(path.stat().st_size / 1e6, 2)}
+    if is_map(path):
+        grid = load_map(path)
+        facts = map_facts(grid) | {'resolution_m': grid.resolution_m}
+    else:
+        facts = open_map(path).facts() | {'file_mb': round(path.stat().st_size / 1e6, 2)}
     if as_json:
         return print_json(facts)
     console.print(value_table('map', list(_rows(facts)), str(path)))
@@ -88,6 +93,10 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
         ('size', f'{width:.1f} x {height:.1f} m'),
         ('free', f'{facts["free_m2"]:.1f} m²'),
         ('occupied', f'{facts["occupied_m2"]:.1f} m²'),
+    ]
+    if 'resolution_m' in facts:
+        return [*rows, ('resolution', f'{facts["resolution_m"]:g} m')]
+    rows += [
         ('way of the keyframes', f'{facts["path_m"]:.1f} m'),
         ('keyframes', str(facts['keyframes'])),
         ('points', str(facts['points'])),
@@ -170,18 +179,23 @@ def prune_map(
 
 @app.command('diff')
 def diff(
-    first: FirstMap,
-    second: SecondMap,
+    first: Annotated[Path, typer.Argument(metavar='A', help='File of --save-map, or map.yaml.')],
+    second: Annotated[Path, typer.Argument(metavar='B', help='File of --save-map, or map.yaml.')],
     out: Annotated[Path, typer.Argument(metavar='OUT.png', help='Picture.')],
     as_json: Json = False,
 ) -> None:
-    """Draw what appeared (red) and what is gone (green) from one map to the other.
+    """Draw what appeared (red) and what is gone (green) from one map to the other. Where one of
+    them is a map.yaml, both are taken to have one frame.
 
     \b
     segfloor map diff monday.map friday.map changes.png
     """
     check_output(out, PNG, [first, second])
-    grid, change = changes(open_map(first), open_map(second))
+    if is_map(first) or is_map(second):
+        then, grid = (load_map(p) if is_map(p) else open_map(p).grid() for p in (first, second))
+        change = changed_cells(resample(then, grid), grid.states)
+    else:
+        grid, change = changes(open_map(first), open_map(second))
     write_output(out, PNG, marked_png(png_bytes(draw_changes(grid, change))))
     areas = {name: grid.area_m2(change == sign) for name, sign in (('appeared', 1), ('gone', -1))}
     if as_json:
@@ -254,7 +268,6 @@ class SavedMap:
         """Return what the map holds, by name: counts, areas in m², metres."""
         slam, camera, mount = self.slam, saved_camera(self.file, self.name), mount_of(self.file)
         grid = self.grid()
-        known_y, known_x = np.nonzero(grid.cells != UNKNOWN)
         poses = loaded_map(self.file, 0).path.T_map_base
         steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
         return {
@@ -262,12 +275,7 @@ class SavedMap:
             'points': len(slam['point_stable_id']),
             'loops': len(slam['loop_ends']),
             'path_m': round(float(steps_m.sum()), 2),
-            'free_m2': round(grid.area_m2(grid.cells == FREE), 2),
-            'occupied_m2': round(grid.area_m2(grid.cells == OCCUPIED), 2),
-            'size_m': [
-                round(float(np.ptp(known) + 1) * grid.resolution_m, 2) if len(known) else 0.0
-                for known in (known_x, known_y)
-            ],
+            **map_facts(grid),
             'camera': f'{camera.width}x{camera.height}, baseline {camera.baseline_m:.3f} m',
             'camera_height_m': round(mount.height_m, 3),
             'classes_m2': self._classes_m2(grid),
@@ -401,11 +409,16 @@ def changes(first: SavedMap, second: SavedMap) -> tuple[OccupancyGrid, NDArray[n
         resample(grid_of(saved.file.parts['grid'] | {'pose': pose}), grid)
         for saved, pose in zip((first, second), poses, strict=True)
     )
+    return grid, changed_cells(then, now)
+
+
+def changed_cells(then: NDArray[np.int8], now: NDArray[np.int8]) -> NDArray[np.int8]:
+    """Return what changed (H, W) between states (H, W) on one raster, as `changes`."""
     stood, stands = (_occupied_or_beside(cells) for cells in (then, now))
-    change = np.zeros(grid.cells.shape, np.int8)
+    change = np.zeros(now.shape, np.int8)
     change[(now == OCCUPIED) & (then == FREE) & ~stood] = 1
     change[(then == OCCUPIED) & (now == FREE) & ~stands] = -1
-    return grid, change
+    return change
 
 
 def draw_changes(grid: OccupancyGrid, change: NDArray[np.int8]) -> NDArray[np.uint8]:

@@ -20,11 +20,13 @@ from segfloor_ros.apps.calibration import (
     CalibrationResult,
     calibrate_folder,
     check_recording,
+    convert_calibration,
 )
 from segfloor_ros.apps.cli import printing, terminal
 from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.apps.cli.terminal import figure_table, number_option, value_table
 from segfloor_ros.apps.cli.view import open_view, show_recording, show_results
+from segfloor_ros.apps.map_files import is_map, load_map, map_facts
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.bag_writer import BagWriter, ImageCoding, NewBag
 from segfloor_ros.apps.recordings.bag_writer import convert as write_bag
@@ -81,6 +83,13 @@ def _known_output(path: Path) -> str:
         return (
             f'results of a drive, {made}: {summary["tracked_frames"]} of {summary["frames"]} '
             f'frames tracked, {summary["keyframes"]} keyframes'
+        )
+    if is_map(path):
+        facts = map_facts(load_map(path))
+        width, height = facts['size_m']
+        return (
+            f'a map of map_server: {width:.1f} x {height:.1f} m known, {facts["free_m2"]:.1f} m² '
+            f'free, {facts["occupied_m2"]:.1f} m² occupied'
         )
     if path.is_file() and is_map_file(path):
         return 'a saved map of segfloor; take it with --load-map'
@@ -294,6 +303,18 @@ def calibrate(
             '--square also by the length of a board in view. Status 1: it does not.',
         ),
     ] = None,
+    other: Annotated[
+        Path | None,
+        typer.Option(
+            '--from',
+            metavar='FILE',
+            help='In place of pictures: write the calibration of another tool (ZED, OAK, Basalt, '
+            'ORB-SLAM, OpenCV, Kalibr, ost.txt) as ROS files into --out.',
+        ),
+    ] = None,
+    size: Annotated[
+        str, typer.Option(help='With --from: WIDTHxHEIGHT of the images, where FILE needs it.')
+    ] = '',
     params: terminal.Params = None,
     assignments: terminal.Set = None,
 ) -> None:
@@ -303,7 +324,21 @@ def calibrate(
     segfloor calibrate pictures --square 0.03 --board 9x6
     segfloor calibrate pictures --square 0.03 --board 10x7 --marker 0.022 --dictionary 5X5_100
     segfloor calibrate --check drive.mcap --square 0.03 --board 9x6
+    segfloor calibrate --from SN12345.conf --size 1280x720 --out zed
     """
+    if other is not None:
+        if folder is not None or recording is not None:
+            raise SettingsError('give --from FILE and --out FOLDER alone')
+        given = re.fullmatch('([1-9][0-9]{0,4})x([1-9][0-9]{0,4})', size)
+        if size and given is None:
+            raise SettingsError(f'--size {size}: expected e.g. 1280x720')
+        target = out or Path()
+        made = convert_calibration(
+            other, None if given is None else (int(given[1]), int(given[2])), target
+        )
+        camera = made.camera
+        words = f'{camera.width}x{camera.height}, baseline {camera.baseline_m:.4f} m'
+        return console.print(f'{target}: left.yaml, right.yaml: {words}', soft_wrap=True)
     sides = re.fullmatch('([0-9]{1,2})x([0-9]{1,2})', board)
     if sides is None:
         raise SettingsError(f'--board {board}: expected e.g. 9x6')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,12 @@ STEP_M = 1.0
 """Of path: errors are those of such steps, and the first one of a plot says what is ahead."""
 
 MIN_MATCHES = 3
+
+OTHER_AXES = 0.3
+"""Radians: axes that are turned by more are others, not those of a path that drifts; and the share
+of a step by which motions may differ in axes that are the same."""
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -117,6 +124,15 @@ def match(
         np.array(evo_truth.poses_se3),
         np.array(evo_estimate.poses_se3),
     )
+    R_truth_estimate = axes_between(matched_truth, matched_estimate)
+    if R_truth_estimate is not None:
+        turn_deg = np.degrees(Rotation.from_matrix(R_truth_estimate).magnitude())
+        logger.warning(
+            'the axes of the estimate are turned by %.0f degrees against those of the truth, as '
+            'optical axes are against those of a base; both are evaluated in those of the truth',
+            turn_deg,
+        )
+        matched_estimate[:, :3, :3] = matched_estimate[:, :3, :3] @ R_truth_estimate.T
     T_truth_estimate = rigid_alignment(matched_estimate[:, :3, 3], matched_truth[:, :3, 3])
     return MatchedTrajectories(
         np.asarray(evo_truth.timestamps),
@@ -125,6 +141,37 @@ def match(
         T_truth_estimate @ matched_estimate,
         frames,
     )
+
+
+def axes_between(truth: Array, estimate: Array) -> Array | None:
+    """Return the rotation (3, 3) from the axes of an estimate (N, 4, 4) to those of the truth
+    (N, 4, 4), by what both say of the same motions in their own axes; None where they are the same
+    or it is not clear.
+    """
+    along_m = np.concatenate([[0.0], np.cumsum(_steps_m(truth))])
+    step_m = min(STEP_M, along_m[-1] / 4)
+    last = np.searchsorted(along_m, along_m + step_m)
+    first = np.flatnonzero(last < len(along_m))
+    if step_m <= 0 or len(first) < MIN_MATCHES:
+        return None
+    motions = (invert(poses[first]) @ poses[last[first]] for poses in (truth, estimate))
+    true, estimated = (
+        np.concatenate([m[:, :3, 3], Rotation.from_matrix(m[:, :3, :3]).as_rotvec()])
+        for m in motions
+    )
+    U, _, Vt = np.linalg.svd(true.T @ estimated)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    as_they_are, turned = (
+        float(np.median(np.linalg.norm(true - one, axis=1)[: len(first)]))
+        for one in (estimated, estimated @ R.T)
+    )
+    is_clear = turned < min(as_they_are / 2, step_m * OTHER_AXES)
+    return R if is_clear and Rotation.from_matrix(R).magnitude() > OTHER_AXES else None
+
+
+def _steps_m(poses: Array) -> Array:
+    steps_m: Array = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    return steps_m
 
 
 def rigid_alignment(points_a: Array, points_b: Array) -> Array:
@@ -170,8 +217,7 @@ def _relative_of_sparse(relation: metrics.PoseRelation, matched: MatchedTrajecto
     """Return the error per metre over pairs of frames: each one and the first that is at least
     `STEP_M` further along the path.
     """
-    steps_m = np.linalg.norm(np.diff(matched.truth[:, :3, 3], axis=0), axis=1)
-    along_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    along_m = np.concatenate([[0.0], np.cumsum(_steps_m(matched.truth))])
     last = np.searchsorted(along_m, along_m + STEP_M - 1e-9)
     first = np.flatnonzero(last < len(along_m))
     if len(first) == 0:
@@ -203,7 +249,7 @@ def _end_error(matched: MatchedTrajectories) -> float:
 
 
 def _path_length(poses: Array) -> float:
-    return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+    return float(_steps_m(poses).sum())
 
 
 def _expected_frames(estimated_s: Array, true_s: Array) -> int:

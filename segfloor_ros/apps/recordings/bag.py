@@ -24,7 +24,8 @@ from segfloor_ros.apps.recordings.files import (
     rate_of,
 )
 from segfloor_ros.apps.recordings.source import PairEntry, StampPairing, StereoSource
-from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration, eye_calibration
+from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.core.camera.camera_info import eye_calibration
 from segfloor_ros.core.camera.depth import depth_calibration, disparity_of_depth
 from segfloor_ros.core.camera.images import Grey, colour_image, depth_image, grey_image
 from segfloor_ros.core.camera.measurements import (
@@ -74,13 +75,11 @@ def open_bag(path: Path, settings: StereoCameraSettings) -> StereoSource:
             topics = bag_topics.find_topics(
                 str(path), types, settings.left_image_topic, settings.right_image_topic
             )
-            calibration = given_calibration(settings) or _read_calibration(path, bag, topics)
+            given = given_calibration(settings, topics.is_rectified)
+            calibration = given or _read_calibration(path, bag, topics)
         count = min(bag.topics[topic].num_messages for topic in (topics.left, topics.right))
-        first = islice(bag.messages([topics.left]), FIRST_MESSAGES)
-        stamps = sorted(_stamp_ns(message, f'{path}, {topics.left}') for _, message in first)
+        stamps, _ = (_first_stamps(path, bag, topic) for topic in (topics.left, topics.right))
         rate_hz = rate_of(stamps)
-        if topics.is_rectified:
-            calibration = calibration.rectified()
         sensors = bag_sensors(path, bag, topics.left, calibration.left.R, settings)
         if stamps:
             # The end is not known before all images are read; half of them may be missing.
@@ -88,7 +87,7 @@ def open_bag(path: Path, settings: StereoCameraSettings) -> StereoSource:
         if depth is not None:
             messages = bag.topics[depth.right].num_messages
             sensors.append(RecordedSensor(DEPTH, depth.right, messages, topics is depth))
-    read = partial(_entries, path, topics, calibration.camera, settings.pairing_tolerance_s)
+    read = partial(_entries, path, topics, calibration.camera, settings)
     return StereoSource(
         str(path),
         calibration,
@@ -104,7 +103,7 @@ def _entries(
     path: Path,
     topics: bag_topics.StereoTopics,
     camera: StereoCamera,
-    tolerance_s: float,
+    settings: StereoCameraSettings,
     source: StereoSource,
 ) -> Iterator[PairEntry]:
     """Yield the images of two topics, paired by their header stamps while they are read."""
@@ -119,16 +118,31 @@ def _entries(
     def load(left: Any, right: Any) -> tuple[Grey, NDArray[Any]]:
         image = (colour_image if source.takes_colour else grey_image)(left, topics.left)
         if topics.right_is_depth:
-            return image, disparity_of_depth(depth_image(right, topics.right), camera)
+            depth = depth_image(right, topics.right)
+            return image, disparity_of_depth(depth, camera, settings.depth_scale or None)
         return image, grey_image(right, topics.right)
 
     names = (f'{path}, {topics.left}', f'{path}, {topics.right}')
-    pairing: StampPairing[Any] = StampPairing(tolerance_s, names)
+    pairing: StampPairing[Any] = StampPairing(settings.pairing_tolerance_s, names)
     with open_bag_file(path) as bag:
         for index, (left, right) in enumerate(pairs(bag)):
             yield PairEntry(index, left.stamp_ns, partial(load, left.item, right.item))
     source.skipped_frames += max(pairing.duplicates)
     pairing.report()
+
+
+def _first_stamps(path: Path, bag: BagFile, topic: str) -> list[int]:
+    """Return the stamps of the first images of a topic in order. Raises InputError where they are
+    all zero.
+    """
+    where, first = f'{path}, {topic}', islice(bag.messages([topic]), FIRST_MESSAGES)
+    stamps = sorted(_stamp_ns(message, where) for _, message in first)
+    if len(stamps) > 1 and not any(stamps):
+        raise InputError(
+            f'{where}: all stamps are zero, so no image has a time; let the driver stamp its '
+            'images and record again'
+        )
+    return stamps
 
 
 def _stamp_ns(message: Any, where: str) -> int:
@@ -144,8 +158,9 @@ def _read_calibration(
     path: Path, bag: BagFile, topics: bag_topics.StereoTopics
 ) -> StereoCalibration:
     given = 'stereo_camera.left_calibration and right_calibration'
-    left = _eye(path, bag, topics.left, topics.left_info, given)
-    return StereoCalibration(left, _eye(path, bag, topics.right, topics.right_info, given))
+    sides = (topics.left, topics.left_info), (topics.right, topics.right_info)
+    eyes = (_eye(path, bag, *side, given, topics.is_rectified) for side in sides)
+    return StereoCalibration(*eyes)
 
 
 def _left_eye(
@@ -153,16 +168,19 @@ def _left_eye(
 ) -> EyeCalibration:
     given = given_left_calibration(settings)
     if given is not None:
-        return given
-    return _eye(path, bag, topics.left, topics.left_info, 'stereo_camera.left_calibration')
+        return given.rectified() if topics.is_rectified else given
+    setting = 'stereo_camera.left_calibration'
+    return _eye(path, bag, topics.left, topics.left_info, setting, topics.is_rectified)
 
 
-def _eye(path: Path, bag: BagFile, image: str, topic: str, setting: str) -> EyeCalibration:
+def _eye(
+    path: Path, bag: BagFile, image: str, topic: str, setting: str, is_rectified: bool
+) -> EyeCalibration:
     if not topic:
         raise CalibrationError(
             f'{path}: no CameraInfo beside {image}; record it too, or give {setting}'
         )
-    return eye_calibration(bag.first(topic), f'{path}, {topic}')
+    return eye_calibration(bag.first(topic), f'{path}, {topic}', is_rectified)
 
 
 def bag_sensors(

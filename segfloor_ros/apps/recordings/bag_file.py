@@ -5,15 +5,17 @@ that a ROS install has; and which of its topics are the stereo pair.
 from __future__ import annotations
 
 import logging
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from itertools import chain, pairwise
 from os.path import commonpath
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from segfloor_ros.apps.recordings.files import SIDES, is_side, side_pairs
+from segfloor_ros.apps.recordings.files import SIDES, is_side, natural_key, side_pairs
 from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.whole import MAX_BYTES, check_file
@@ -25,7 +27,9 @@ MCAP_MAGIC = b'\x89MCAP0\r\n'
 """At the beginning and the end of an mcap file."""
 
 BAG_SUFFIXES = {'.mcap', '.db3', '.bag'}
-REPAIRS = {'.mcap': 'mcap recover', '.bag': 'rosbag reindex'}
+COMPRESSED_SUFFIXES = {'.zstd', '.zst'}
+ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+REPAIRS = {'.mcap': 'mcap recover', '.db3': 'sqlite3 FILE .recover', '.bag': 'rosbag reindex'}
 TF_DEFINITION = 'geometry_msgs/TransformStamped[] transforms'
 MISSING_LIBRARY = (
     'bags are read by rosbag2_py of a ROS installation, or by the Python package rosbags, which '
@@ -110,36 +114,128 @@ def is_bag(path: Path) -> bool:
     """Whether `path` is a bag file or a folder with one."""
     if path.is_dir():
         return (path / 'metadata.yaml').exists() or bool(_files_in(path))
-    return path.suffix in BAG_SUFFIXES
+    return _suffix(path) in BAG_SUFFIXES
+
+
+def _suffix(path: Path) -> str:
+    """Return the end of a file's name, of a compressed one that before it."""
+    return (path.with_suffix('') if path.suffix in COMPRESSED_SUFFIXES else path).suffix
 
 
 @contextmanager
 def open_bag_file(path: Path) -> Iterator[BagFile]:
-    """Open a rosbag2 folder, an mcap or sqlite3 file, or a ROS 1 bag. Raises InputError."""
-    path = _bag_path(path)
-    if _ros_reader is not None and path.suffix != '.bag':
+    """Open a rosbag2 folder, an mcap or sqlite3 file, or a ROS 1 bag. A folder is read by its
+    files, the parts of one bag in the order of their times. Raises InputError.
+    """
+    if _ros_reader is not None and (path / 'metadata.yaml').exists():
+        check_file(path / 'metadata.yaml')
         with _read_errors(path):
             found = _ros_reader(path)
         yield BagFile(path, *found)
         return
-    if path.suffix == '.mcap' and _lacks_its_end(path):
-        with _read_errors(path):
-            found = _open_cut_mcap(path)
-        if path not in _warned_of:  # recordings are read more than once
-            _warned_of.add(path)
-            logger.warning('%s: its recording was interrupted; what was written is read', path)
-        yield BagFile(path, *found)
+    with ExitStack() as stack:
+        parts = [stack.enter_context(_open_part(file)) for file in _bag_files(path)]
+        parts.sort(key=lambda part: part.begin_ns)
+        if not (path / 'metadata.yaml').exists():
+            _check_parts(path, parts)
+        topics: dict[str, Topic] = {}
+        for part in parts:
+            for name, topic in part.topics.items():
+                before = topics.get(name, Topic(topic.msgtype, 0)).num_messages
+                topics[name] = Topic(topic.msgtype, before + topic.num_messages)
+        yield BagFile(path, topics, lambda names: chain.from_iterable(p.read(names) for p in parts))
+
+
+class _Part(NamedTuple):
+    """One file of a bag, from its first message to its last, 0 where that is not known."""
+
+    path: Path
+    topics: dict[str, Topic]
+    read: ReadMessages
+    begin_ns: int = 0
+    end_ns: int = 0
+
+
+def _bag_files(path: Path) -> list[Path]:
+    """Return the files of a bag: those that its metadata.yaml names, else all in its folder."""
+    if not path.is_dir():
+        check_file(path)
+        return [path]
+    files = _files_in(path)
+    if (path / 'metadata.yaml').exists():
+        information = read_yaml(path / 'metadata.yaml', 'rosbag2_bagfile_information')
+        about = information.get('rosbag2_bagfile_information')
+        listed = about.get('relative_file_paths') if isinstance(about, dict) else None
+        names = [Path(str(name)).name for name in listed] if isinstance(listed, list) else []
+        missing = [name for name in names if not (path / name).exists()]
+        if missing and len(missing) < len(names):
+            raise InputError(
+                f'{path}: {missing[0]}, which metadata.yaml names, is not there; complete the copy'
+            )
+        if names and not missing:
+            files = [path / name for name in names]
+    if not files:
+        raise InputError(f'{path}: holds metadata.yaml, but no bag; complete the copy')
+    for file in files:
+        check_file(file)
+    return files
+
+
+def _files_in(folder: Path) -> list[Path]:
+    return sorted(
+        (path for path in folder.iterdir() if _suffix(path) in BAG_SUFFIXES), key=natural_key
+    )
+
+
+def _check_parts(path: Path, parts: Sequence[_Part]) -> None:
+    """Raise InputError where the files of a folder are not one after the other, of one bag."""
+    for one, following in pairwise(parts):
+        if one.end_ns > following.begin_ns or not one.topics.keys() & following.topics.keys():
+            names = ', '.join(sorted(part.path.name for part in parts))
+            raise InputError(f'{path}: holds {len(parts)} bags ({names}); name one of them')
+
+
+@contextmanager
+def _open_part(path: Path) -> Iterator[_Part]:
+    with _uncompressed(path) as file:
+        if _ros_reader is not None and file.suffix != '.bag':
+            with _read_errors(path):
+                found = _ros_reader(file)
+            yield _Part(path, *found)
+        elif file.suffix == '.mcap' and _lacks_its_end(file):
+            with _read_errors(path):
+                part = _open_mcap_stream(file)
+            if path not in _warned_of:  # recordings are read more than once
+                _warned_of.add(path)
+                logger.warning('%s: its recording was interrupted; what was written is read', path)
+            yield part
+        else:
+            with _rosbags_reader(file, path) as part:
+                yield part
+
+
+@contextmanager
+def _uncompressed(path: Path) -> Iterator[Path]:
+    """Yield a file, of a compressed one a copy that lasts as long."""
+    if path.suffix not in COMPRESSED_SUFFIXES:
+        yield path
         return
-    with _rosbags_reader(path) as (reader, decode):
+    import zstandard  # comes with mcap
 
-        def read(names: Sequence[str]) -> Iterator[tuple[str, Any]]:
-            connections = [c for c in reader.connections if c.topic in names]
-            for connection, _, data in reader.messages(connections):
-                yield connection.topic, decode(data, connection.msgtype)
+    with tempfile.TemporaryDirectory(prefix='segfloor_bag_') as folder:
+        copy = Path(folder, path.stem)
+        with _read_errors(path), path.open('rb') as packed, copy.open('wb') as out:
+            zstandard.ZstdDecompressor().copy_stream(packed, out)
+        yield copy
 
-        with _read_errors(path):
-            topics = {n: _topic(path, n, info) for n, info in reader.topics.items()}
-        yield BagFile(path, topics, read)
+
+def _message_data(data: bytes) -> bytes:
+    """Return the bytes of a message, which rosbag2 may have compressed one by one."""
+    if bytes(data[:4]) != ZSTD_MAGIC:
+        return data
+    import zstandard  # comes with mcap
+
+    return zstandard.ZstdDecompressor().decompress(data)
 
 
 def _lacks_its_end(path: Path) -> bool:
@@ -150,36 +246,63 @@ def _lacks_its_end(path: Path) -> bool:
         return begins and file.read() != MCAP_MAGIC
 
 
-def _open_cut_mcap(path: Path) -> tuple[dict[str, Topic], ReadMessages]:
-    """Return topics and messages of the complete chunks of an mcap file (https://mcap.dev/spec)."""
+def _open_mcap_stream(path: Path) -> _Part:
+    """Read an mcap file from its begin (https://mcap.dev/spec): the complete chunks of one that was
+    cut, or the channels of ROS 2 in one that has others, too, e.g. in protobuf.
+    """
     from mcap.exceptions import McapError
     from mcap.records import Channel, Message, Schema
     from mcap.stream_reader import StreamReader
     from rosbags.typesys import Stores, get_typestore
 
     decode = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
+    others: set[str] = set()
 
-    def messages() -> Iterator[tuple[str, str, bytes]]:
+    def messages() -> Iterator[tuple[str, str, int, bytes]]:
         kinds: dict[int, str] = {}
         topics: dict[int, tuple[str, str]] = {}
         with path.open('rb') as file, suppress(McapError):
             for record in StreamReader(file, record_size_limit=MAX_BYTES).records:
                 if isinstance(record, Schema):
                     kinds[record.id] = record.name
+                elif isinstance(record, Channel) and record.message_encoding != 'cdr':
+                    others.add(record.message_encoding)
                 elif isinstance(record, Channel):
-                    topics[record.id] = record.topic, kinds[record.schema_id]
-                elif isinstance(record, Message):
-                    yield *topics[record.channel_id], record.data
+                    topics[record.id] = record.topic, kinds.get(record.schema_id, '')
+                elif isinstance(record, Message) and record.channel_id in topics:
+                    yield *topics[record.channel_id], record.log_time, record.data
 
     def read(names: Sequence[str]) -> Iterator[tuple[str, Any]]:
-        for topic, kind, data in messages():
+        for topic, kind, _, data in messages():
             if topic in names:
-                yield topic, decode(data, kind)
+                yield topic, _decoded(decode, topic, kind, data)
 
-    counts = Counter((topic, kind) for topic, kind, _ in messages())
+    counts: Counter[tuple[str, str]] = Counter()
+    begin_ns = end_ns = 0
+    for topic, kind, stamp_ns, _ in messages():
+        counts[topic, kind] += 1
+        begin_ns, end_ns = min(begin_ns or stamp_ns, stamp_ns), max(end_ns, stamp_ns)
+    if not counts and others:
+        raise InputError(
+            f'{path}: its messages are in {", ".join(sorted(others))}, not those of ROS 2 (cdr); '
+            'record the topics by ROS'
+        )
     if not counts:
         raise ValueError('it ends before its first chunk does')
-    return {topic: Topic(kind, count) for (topic, kind), count in counts.items()}, read
+    topics = {topic: Topic(kind, count) for (topic, kind), count in counts.items()}
+    return _Part(path, topics, read, begin_ns, end_ns)
+
+
+def _decoded(decode: Callable[[bytes, str], Any], topic: str, kind: str, data: bytes) -> Any:
+    """Return a message. Raises InputError."""
+    try:
+        return decode(_message_data(data), kind)
+    except Exception as error:  # damaged bytes make the library fail in any way
+        reason = ' '.join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f'{topic}: a message of type {kind} cannot be read ({reason}); is it recorded with the '
+            'types of ROS?'
+        ) from error
 
 
 def _topic(path: Path, name: str, info: Any) -> Topic:
@@ -189,14 +312,14 @@ def _topic(path: Path, name: str, info: Any) -> Topic:
 
 
 @contextmanager
-def _rosbags_reader(path: Path) -> Iterator[tuple[Any, Any]]:
-    """Open a bag with `rosbags`; yields its reader and what decodes a message."""
+def _rosbags_reader(path: Path, name: Path) -> Iterator[_Part]:
+    """Open a file with `rosbags`. name: in messages."""
     try:
         from rosbags import rosbag1, rosbag2
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError:
-        raise InputError(f'{path}: {MISSING_LIBRARY}') from None
-    with _read_errors(path):
+        raise InputError(f'{name}: {MISSING_LIBRARY}') from None
+    with ExitStack() as stack, _read_errors(name):
         if path.suffix == '.bag':
             reader: Any = rosbag1.Reader(path)
             typestore = get_typestore(Stores.ROS1_NOETIC)
@@ -205,11 +328,33 @@ def _rosbags_reader(path: Path) -> Iterator[tuple[Any, Any]]:
         else:
             reader = rosbag2.Reader(path)
             decode = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
-        reader.open()
-    try:
-        yield reader, decode
-    finally:
-        reader.close()
+        try:
+            reader.open()
+        except Exception:
+            if path.suffix != '.mcap':
+                raise
+            try:
+                part = _open_mcap_stream(path)
+            except ValueError:
+                part = None
+            if part is None:
+                raise
+        else:
+            stack.callback(reader.close)
+            topics = {n: _topic(name, n, info) for n, info in reader.topics.items()}
+
+            def read(names: Sequence[str]) -> Iterator[tuple[str, Any]]:
+                connections = [c for c in reader.connections if c.topic in names]
+                # Without connections all messages would come.
+                for connection, _, data in reader.messages(connections) if connections else ():
+                    topic, kind = connection.topic, connection.msgtype
+                    yield topic, _decoded(decode, topic, kind, data)
+
+            begin_ns, end_ns = (reader.start_time, reader.end_time) if topics else (0, 0)
+            part = _Part(name, topics, read, begin_ns, end_ns - 1)
+        kept = stack.pop_all()
+    with kept:
+        yield part
 
 
 @contextmanager
@@ -217,37 +362,19 @@ def _read_errors(path: Path) -> Iterator[None]:
     """Turn what the library raises about a damaged bag into an InputError."""
     try:
         yield
+    except InputError as error:
+        if str(path) in str(error):
+            raise
+        raise InputError(f'{path}, {error}') from error
     except Exception as error:  # damaged bytes make the library fail in any way, anywhere
         reason = ' '.join(str(error).split()) or type(error).__name__
         if isinstance(error, MemoryError):
             reason = 'it asks for more memory than there is'
-        repair = REPAIRS.get(path.suffix, 'ros2 bag reindex')
+        repair = REPAIRS.get(_suffix(path), 'ros2 bag reindex')
         raise InputError(
             f'{path}: cannot read the bag ({reason}); if its recording was interrupted, repair it '
             f'with {repair}'
         ) from error
-
-
-def _bag_path(path: Path) -> Path:
-    if not path.is_dir():
-        check_file(path)
-        return path
-    files = _files_in(path)
-    if (path / 'metadata.yaml').exists():
-        # Libraries read this file without bounds.
-        read_yaml(path / 'metadata.yaml', 'rosbag2_bagfile_information')
-        for file in files:
-            check_file(file)
-        return path
-    if len(files) != 1:
-        names = ', '.join(file.name for file in files)
-        raise InputError(f'{path}: holds {len(files)} bags ({names}); name one of them')
-    check_file(files[0])
-    return files[0]
-
-
-def _files_in(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.suffix in BAG_SUFFIXES)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ KITTI (calib.txt); read, written, and found beside a recording.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import yaml
 
 from segfloor_ros.apps.recordings.extrinsics import calibration_from_extrinsics
+from segfloor_ros.apps.recordings.other_calibrations import SUFFIXES, form_of, read_other
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.errors import CalibrationError
@@ -41,18 +43,23 @@ FILE_NAMES = (
 )
 
 
-def read_calibration(left: Path, right: Path) -> StereoCalibration:
+def read_calibration(left: Path, right: Path, is_rectified: bool = False) -> StereoCalibration:
     """Read a pair of ROS camera calibration files or of EuRoC sensor files, or one file of Kalibr,
-    twice.
+    twice. is_rectified: for images that are rectified already.
 
     Raises CalibrationError naming the file when one is missing, incomplete or impossible.
     """
+    paths = [*dict.fromkeys((left, right))]
+    if form_of(*paths) is not None:
+        found = read_other(*paths)
+        return found.rectified() if is_rectified else found
     documents = _read(left), _read(right)
     if all('T_BS' in document for document in documents):
         return _from_euroc(left, right, *documents)
     if all('cam1' in document for document in documents):
         return _from_kalibr(left, documents[0])
-    return StereoCalibration(_ros_eye(documents[0], str(left)), _ros_eye(documents[1], str(right)))
+    eyes = (_ros_eye(d, str(path)) for d, path in zip(documents, (left, right), strict=True))
+    return StereoCalibration(*(eye.rectified() if is_rectified else eye for eye in eyes))
 
 
 def read_kitti_calibration(
@@ -87,8 +94,18 @@ def read_kitti_eye(path: Path, width: int, height: int, camera: int) -> EyeCalib
 
 
 def read_eye_calibration(path: Path) -> EyeCalibration:
-    """Read one ROS camera calibration file. Raises CalibrationError."""
-    return _ros_eye(_read(path), str(path))
+    """Read one ROS camera calibration file, of which the projection may be missing, or the left
+    camera of a file of another form. Raises CalibrationError.
+    """
+    if form_of(path) is not None:
+        return read_other(path).left
+    document = dict(_read(path))
+    if 'camera_matrix' in document:
+        K = _matrix(document['camera_matrix'], 9, f'{path}, camera_matrix').reshape(3, 3)
+        P = _matrix(document.get('projection_matrix', [0.0]), None, f'{path}, projection_matrix')
+        if not P.any():
+            document['projection_matrix'] = {'data': np.hstack([K, np.zeros((3, 1))])}
+    return _ros_eye(document, str(path))
 
 
 def read_body_pose(path: Path) -> Array:
@@ -253,22 +270,32 @@ def _whole(value: Any, where: str) -> int:
     return value
 
 
-def given_calibration(settings: StereoCameraSettings) -> StereoCalibration | None:
-    """Return the calibration that the settings name, or None when they name none.
+def given_calibration(
+    settings: StereoCameraSettings, is_rectified: bool = False
+) -> StereoCalibration | None:
+    """Return the calibration that the settings name, or None when they name none. is_rectified:
+    the images are rectified already, by their own projections.
 
     Raises CalibrationError, also when only one of the two files is given.
     """
     left, right = settings.left_calibration, settings.right_calibration
     if not left and not right:
         return None
-    if left and not right and 'cam1' in _read(Path(left)):
+    if left and not right and holds_both(Path(left)):
         right = left
     if not left or not right:
         raise CalibrationError(
             'stereo_camera.left_calibration and stereo_camera.right_calibration belong together; '
             f'only {left or right} is given'
         )
-    return read_calibration(Path(left), Path(right))
+    return read_calibration(Path(left), Path(right), is_rectified)
+
+
+def holds_both(path: Path) -> bool:
+    """Whether one file has the calibration of both cameras. Raises CalibrationError."""
+    return form_of(_present(path)) is not None or (
+        path.suffix in ('.yaml', '.yml') and 'cam1' in _read(path)
+    )
 
 
 def given_left_calibration(settings: StereoCameraSettings) -> EyeCalibration | None:
@@ -277,6 +304,20 @@ def given_left_calibration(settings: StereoCameraSettings) -> EyeCalibration | N
     """
     name = settings.left_calibration
     return read_eye_calibration(Path(name)) if name else None
+
+
+def _both_in(folder: Path) -> list[Path]:
+    """Return the files of a folder that hold the calibration of both cameras."""
+    found = []
+    for path in sorted(folder.iterdir() if folder.is_dir() else ()):
+        with suppress(CalibrationError):  # of another kind
+            if path.suffix.lower() in SUFFIXES and path.stat().st_size < MOST_BYTES:
+                found += [path] if holds_both(path) else []
+    return found
+
+
+MOST_BYTES = 1 << 18
+"""Of a calibration that is looked for."""
 
 
 def find_calibration(
@@ -293,6 +334,15 @@ def find_calibration(
         for left, right in FILE_NAMES:
             if (folder / left).exists() or (folder / right).exists():
                 return read_calibration(folder / left, folder / right)
+        others = _both_in(folder)
+        if len(others) > 1:
+            names = ', '.join(path.name for path in others)
+            raise CalibrationError(
+                f'{folder}: holds several calibrations ({names}); name one of them by '
+                'stereo_camera.left_calibration'
+            )
+        if others:
+            return read_calibration(others[0], others[0])
     raise CalibrationError(
         f'{name}: no calibration; put left.yaml and right.yaml (ROS camera_calibration) into '
         f'{folders[0]}, or give stereo_camera.left_calibration and right_calibration'

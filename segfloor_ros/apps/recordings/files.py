@@ -28,7 +28,14 @@ from segfloor_ros.core.camera.recording import DEPTH, RecordedSensor
 from segfloor_ros.core.contracts import ImuSample, Measurement, WheelPose
 from segfloor_ros.core.errors import CorruptImageError, InputError
 from segfloor_ros.core.files.images import read_colour, read_grey
-from segfloor_ros.core.files.whole import nanoseconds, number, read_lines, whole_nanoseconds
+from segfloor_ros.core.files.whole import (
+    digits_of,
+    nanoseconds,
+    number,
+    read_lines,
+    time_of,
+    whole_nanoseconds,
+)
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.quaternions import rotations_of
 from segfloor_ros.nodes.shared.joining import Stamped
@@ -65,24 +72,35 @@ ACCEL_RANGE_M_S2 = (7.0, 13.0)
 
 
 def read_times(path: Path) -> list[int]:
-    """Return the stamps in ns of a file with one time in seconds per line.
+    """Return the stamps in ns of a file with one time per line: in seconds or another unit
+    (`digits_of`), or a date with the time of day.
 
     Raises InputError naming the line where one is no number or earlier than the one before; and
     where all are the same.
     """
-    stamps: list[int] = []
-    for where, line in read_lines(path):
-        try:
-            stamp_ns = nanoseconds(line.split()[0])
-        except ValueError as error:
-            raise InputError(f'{where}: expected a time in seconds ({error})') from None
-        check_forward(where, stamps[-1:], stamp_ns)
-        stamps.append(stamp_ns)
+    stamps = stamps_of(path, [time_of(line) for _, line in read_lines(path)])
     if len(stamps) > 1 and stamps[0] == stamps[-1]:
         raise InputError(
             f'{path}: all {len(stamps)} times are the same; it needs the time in seconds of each '
             'pair, or remove it to read the images at stereo_camera.rate_hz'
         )
+    return stamps
+
+
+def stamps_of(path: Path, times: Sequence[str]) -> list[int]:
+    """Return the stamps in ns of the times in the lines of a file. Raises InputError naming the
+    line.
+    """
+    digits = digits_of(times, str(path))
+    wheres = (where for where, _ in read_lines(path))
+    stamps: list[int] = []
+    for where, time in zip(wheres, times, strict=True):
+        try:
+            stamp_ns = nanoseconds(time, digits)
+        except ValueError as error:
+            raise InputError(f'{where}: expected a time in seconds ({error})') from None
+        check_forward(where, stamps[-1:], stamp_ns)
+        stamps.append(stamp_ns)
     return stamps
 
 
@@ -311,7 +329,8 @@ def _sensor(
 
 def read_wheel_odometry(path: Path) -> list[WheelPose]:
     """Return the poses of a file in the TUM format. Raises InputError naming file and line."""
-    table, stamps_ns = _read_table(path, 8, TUM_COLUMNS, nanoseconds)
+    digits = digits_of((time_of(line) for _, line in read_lines(path)), str(path))
+    table, stamps_ns = _read_table(path, 8, TUM_COLUMNS, partial(nanoseconds, digits=digits))
     norms = np.linalg.norm(table[:, 3:7], axis=1)
     bad = np.flatnonzero(np.abs(norms - 1) > 0.01)
     if len(bad):

@@ -32,18 +32,20 @@ from segfloor_ros.apps.recordings.files import (
     check_times,
     folder_sensors,
     is_side,
+    rate_of,
     read_times,
     side_pairs,
     stamps_of_rate,
 )
-from segfloor_ros.apps.recordings.source import StereoSource
+from segfloor_ros.apps.recordings.other_calibrations import read_other
+from segfloor_ros.apps.recordings.source import PLAUSIBLE_HZ, StereoSource
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.depth import depth_calibration, disparity_of_depth
 from segfloor_ros.core.camera.recording import DEPTH, RecordedSensor
 from segfloor_ros.core.camera.settings import StereoCameraSettings
-from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.errors import CalibrationError, InputError
 from segfloor_ros.core.files.images import read_depth
-from segfloor_ros.core.files.whole import END_NS, nanoseconds, whole_nanoseconds
+from segfloor_ros.core.files.whole import END_NS, nanoseconds, read_lines, whole_nanoseconds
 from segfloor_ros.core.geometry import Array, invert, make_transform
 from segfloor_ros.nodes.shared.joining import Stamped
 
@@ -59,11 +61,16 @@ INDEX = 'data.csv'
 SENSOR = 'sensor.yaml'
 
 KITTI_CAMERAS = ((0, 1), (2, 3))
+KITTI_RAW = 'calib_cam_to_cam.txt'
+"""Calibration of a day of KITTI's raw recordings, beside the folders of its drives."""
 
 TUM_UNIT_M = 1 / 5000
 """Depth images of the TUM RGB-D benchmark (Sturm et al., IROS 2012)."""
 
 TUM_TOLERANCE_S = 0.02
+TUM_SIZE = 640, 480
+TUM_PAIRS = ('associations.txt', 'association.txt', 'associate.txt', 'assoc.txt')
+"""Lists of pairs, as the benchmark's own tool and ORB-SLAM have them."""
 TUM_CAMERAS = {
     'freiburg1': (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     'freiburg2': (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
@@ -98,7 +105,14 @@ def open_image_folders(folder: Path, settings: StereoCameraSettings) -> StereoSo
         for number, (i, j) in enumerate(zip(*places, strict=True))
     ]
     near = (folder, left[0].parent, left[0].parent.parent)
-    calibration = find_calibration(str(folder), near, settings)
+    raw = next((p for p in (folder / KITTI_RAW, folder.parent / KITTI_RAW) if p.is_file()), None)
+    calibration = None if raw is None else given_calibration(settings)
+    if raw is not None and calibration is None:
+        number = left[0].parts[-3].removeprefix('image_')
+        cameras = ('02', '03') if number == '02' else ('00', '01')
+        size = files.first_image_size(left, str(folder))
+        calibration = read_other(raw, size=size, cameras=cameras)
+    calibration = calibration or find_calibration(str(folder), near, settings)
     sensors = folder_sensors(folder, settings.ignored_sensors)
     return files.file_pair_source(str(folder), pairs, calibration, settings.bit_depth, sensors)
 
@@ -165,22 +179,34 @@ def _nested_images(folder: Path) -> list[Path]:
 
 
 def _stamps(folder: Path, left: Sequence[Path], rate_hz: float) -> list[int]:
-    """Stamps from a file of times, from names that are times in ns, or else from the rate."""
-    for name in TIME_FILES:
-        if (folder / name).exists():
-            stamps = read_times(folder / name)
-            check_times(folder / name, stamps, left)
-            return stamps
+    """Stamps from a file of times, in the folder or beside its left images, from names that are
+    times in ns, or else from the rate.
+    """
+    for place in dict.fromkeys((folder, left[0].parent, left[0].parent.parent)):
+        for name in TIME_FILES:
+            if (place / name).exists():
+                return _indices_and_stamps(place / name, left, rate_hz)[1]
     if all(len(path.stem) >= NANOSECOND_DIGITS for path in left):
         with contextlib.suppress(ValueError):
             return [whole_nanoseconds(path.stem) for path in left]
     return stamps_of_rate(len(left), rate_hz)
 
 
+def _are_numbers(sides: tuple[list[Path], list[Path]] | None) -> bool:
+    """Whether the names of the left images are no stamps in ns, but e.g. numbers in a row."""
+    names = [path.stem for path in sides[0]] if sides else []
+    if not all(name.isdecimal() for name in names):
+        return True
+    return len(names) > 1 and rate_of([int(name) for name in names]) > PLAUSIBLE_HZ[1]
+
+
 def is_euroc(folder: Path) -> bool:
-    """Whether `folder` (or its `mav0`) looks like an EuRoC sequence."""
+    """Whether `folder` (or its `mav0`) looks like an EuRoC sequence: by its files, or else by its
+    folders.
+    """
     root = _root(folder)
-    return any((root / cam / name).exists() for cam in EUROC_CAMERAS for name in (INDEX, SENSOR))
+    names = (INDEX, SENSOR, 'data') if root != folder else (INDEX, SENSOR)
+    return any((root / cam / name).exists() for cam in EUROC_CAMERAS for name in names)
 
 
 def open_euroc(folder: Path, settings: StereoCameraSettings) -> StereoSource:
@@ -189,6 +215,8 @@ def open_euroc(folder: Path, settings: StereoCameraSettings) -> StereoSource:
     Raises InputError or CalibrationError.
     """
     root = _root(folder)
+    if not (root / EUROC_CAMERAS[0] / INDEX).exists() and _are_numbers(_side_images(root)):
+        return open_image_folders(root, settings)
     left, right = (_read_index(root / camera) for camera in EUROC_CAMERAS)
     names = (str(root / EUROC_CAMERAS[0]), str(root / EUROC_CAMERAS[1]))
     pairs = files.pairs_by_stamp(left, right, settings.pairing_tolerance_s, names)
@@ -323,10 +351,10 @@ def _depth_source(
     metres_per_unit: float | None = None,
 ) -> StereoSource:
     """Return images with depth images in place of the right ones. left: of the raw images."""
-    calibration = depth_calibration(left)
+    calibration, scale = depth_calibration(left), settings.depth_scale or metres_per_unit
 
     def read_disparity(path: Path) -> NDArray[Any]:
-        return disparity_of_depth(read_depth(path), calibration.camera, metres_per_unit)
+        return disparity_of_depth(read_depth(path), calibration.camera, scale)
 
     found = RecordedSensor(DEPTH, str(pairs[0].right.parent), len(pairs), True)
     others = [sensor for sensor in sensors if sensor.name != DEPTH]
@@ -373,8 +401,15 @@ def with_depth(
 
 
 def is_tum_rgbd(folder: Path) -> bool:
-    """Whether `folder` looks like a sequence of the TUM RGB-D benchmark."""
-    return all((folder / name).is_file() for name in ('rgb.txt', 'depth.txt'))
+    """Whether `folder` looks like a sequence of the TUM RGB-D benchmark: with both lists of images,
+    or with one of pairs.
+    """
+    lists = all((folder / name).is_file() for name in ('rgb.txt', 'depth.txt'))
+    return lists or _associations(folder) is not None
+
+
+def _associations(folder: Path) -> Path | None:
+    return next((folder / name for name in TUM_PAIRS if (folder / name).is_file()), None)
 
 
 def open_tum_rgbd(folder: Path, settings: StereoCameraSettings) -> StereoSource:
@@ -382,8 +417,13 @@ def open_tum_rgbd(folder: Path, settings: StereoCameraSettings) -> StereoSource:
 
     Raises InputError or CalibrationError.
     """
-    names = (str(folder / 'rgb.txt'), str(folder / 'depth.txt'))
-    colour, depth = (_read_list(Path(name)) for name in names)
+    pairs_file = None if (folder / 'rgb.txt').is_file() else _associations(folder)
+    if pairs_file is None:
+        names = (str(folder / 'rgb.txt'), str(folder / 'depth.txt'))
+        colour, depth = (_read_list(Path(name)) for name in names)
+    else:
+        names = (f'{pairs_file}, colour', f'{pairs_file}, depth')
+        colour, depth = _read_associations(pairs_file, settings.rate_hz)
     tolerance_s = max(settings.pairing_tolerance_s, TUM_TOLERANCE_S)
     pairs = files.pairs_by_stamp(colour, depth, tolerance_s, names)
     eye = given_left_calibration(settings) or _tum_camera(folder, [pair.left for pair in pairs])
@@ -395,12 +435,51 @@ def _tum_camera(folder: Path, images: Sequence[Path]) -> EyeCalibration:
     for name in CALIBRATIONS:
         if (folder / name).exists():
             return read_eye_calibration(folder / name)
-    fx, fy, cx, cy, distortion = next(
-        value for key, value in TUM_CAMERAS.items() if key in folder.resolve().name
+    part, (fx, fy, cx, cy, distortion) = next(
+        (key, value) for key, value in TUM_CAMERAS.items() if key in folder.resolve().name
     )
+    width, height = files.first_image_size(images, str(folder))
+    here = f'put camera.yaml into {folder}, or give stereo_camera.left_calibration'
+    if (width, height) != TUM_SIZE:
+        raise CalibrationError(
+            f'{folder}: no calibration: its images are {width}x{height}, those of the TUM RGB-D '
+            f'benchmark are 640x480; {here}'
+        )
+    if not part:
+        logger.warning(
+            '%s: no calibration; that of a first Kinect is taken, fx = 525 px; %s', folder, here
+        )
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    size = files.first_image_size(images, str(folder))
-    return EyeCalibration.of_raw(size, K, np.array(distortion), origin='the TUM RGB-D benchmark')
+    return EyeCalibration.of_raw(
+        TUM_SIZE, K, np.array(distortion), origin='the TUM RGB-D benchmark'
+    )
+
+
+def _read_associations(file: Path, rate_hz: float) -> list[list[Stamped[Path]]]:
+    """Return colour and depth of a file of pairs: time, image, time, image, in any order. Numbers
+    of frames in place of times stand for the rate.
+    """
+    rows = []
+    for where, line in read_lines(file):
+        words = line.split()
+        if len(words) != 4 or 'depth' not in words[1] + words[3]:
+            raise InputError(f'{where}: expected a time, an rgb image, a time and a depth image')
+        rows.append(words if 'depth' in words[3] else words[2:] + words[:2])
+    if not rows:
+        raise InputError(f'{file}: names no image')
+    numbers = [words[0] for words in rows]
+    if all(n.isdecimal() and int(n) == int(numbers[0]) + i for i, n in enumerate(numbers)):
+        stamps = [stamps_of_rate(len(rows), rate_hz)] * 2
+    else:
+        sides = ([words[i] for words in rows] for i in (0, 2))
+        stamps = [files.stamps_of(file, side) for side in sides]
+    return [
+        [
+            Stamped(stamp_ns, file.parent / words[1 + 2 * side])
+            for stamp_ns, words in zip(stamps[side], rows, strict=True)
+        ]
+        for side in (0, 1)
+    ]
 
 
 def _read_list(index: Path) -> list[Stamped[Path]]:

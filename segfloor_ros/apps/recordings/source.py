@@ -5,6 +5,7 @@ ahead, and the left and right images of a recording joined by their stamps, in t
 from __future__ import annotations
 
 import logging
+import re
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -114,7 +115,7 @@ class StereoSource:
         self.takes_colour = False
         self._part = slice(0, None)
         self.skipped_frames = 0
-        self._warned_of: set[int] = set()
+        self._warned_of: dict[str, str] = {}
         self._has_read_pair = self._has_read_mask = False
         self._eight_bit = EightBitScale(bit_depth)
         self._check_first_pair()
@@ -168,7 +169,8 @@ class StereoSource:
         bit depth.
         """
         if next(self._decoded(), None) is None:
-            raise InputError(f'{self.name}: no pair of images in it can be read')
+            reasons = ''.join(f'; {reason}' for reason in self._warned_of.values())
+            raise InputError(f'{self.name}: no pair of images in it can be read{reasons}')
 
     def entries(self) -> Iterator[PairEntry]:
         """Yield the pairs of `frames()`, not decoded yet."""
@@ -238,10 +240,11 @@ class StereoSource:
         return StereoRectifier(self.calibration)
 
     def skip(self, index: int, reason: str) -> None:
-        """Count a pair that is left out, with a warning."""
+        """Count a pair that is left out, with a warning for the first one of a kind."""
         self.skipped_frames += 1
-        if index not in self._warned_of:  # recordings are read more than once
-            self._warned_of.add(index)
+        kind = re.sub(r'[0-9]+', '', reason)
+        if kind not in self._warned_of:  # recordings are read more than once
+            self._warned_of[kind] = reason
             logger.warning('%s: frame %d is skipped: %s', self.name, index, reason)
 
 

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from segfloor_ros import MAX_PIXELS
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.errors import CalibrationError, InputError
+from segfloor_ros.core.errors import CalibrationError
 from segfloor_ros.core.geometry import Array
 
 COEFFICIENTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14), 'equidistant': (4,)}
@@ -34,6 +32,12 @@ MODEL_ALIASES = {
 SAME_PX = 1e-3
 """Intrinsics that differ by less than this are the same."""
 
+PINHOLE_ZEROS = {(0, 1): SAME_PX, (1, 0): SAME_PX, (2, 0): 1e-6, (2, 1): 1e-6, (2, 2): 1e-6}
+"""How far the other elements of K and P may be from those of the identity, by row and column."""
+
+SAME_ROWS = 0.1
+"""Share of the baseline by which one eye may be higher; KITTI's are by 0.007."""
+
 
 @dataclass(frozen=True, eq=False)
 class EyeCalibration:
@@ -42,7 +46,8 @@ class EyeCalibration:
     K (3, 3): intrinsics of the raw image; D (n,): distortion; R (3, 3): rotation from the raw
     to the rectified optical frame; P (3, 4): projection of the rectified camera, P[0, 3] = -fx *
     baseline for the right one. Raw and rectified images have the same size. `origin` names the
-    file or topic in messages. Raises CalibrationError for impossible values.
+    file or topic in messages. is_part: of an image cut out of the camera's, whose principal point
+    may lie outside of it. Raises CalibrationError for impossible values.
     """
 
     width: int
@@ -53,6 +58,7 @@ class EyeCalibration:
     P: Array
     distortion_model: str = 'plumb_bob'
     origin: str = 'calibration'
+    is_part: bool = False
 
     def __post_init__(self) -> None:
         model = MODEL_ALIASES.get(self.distortion_model.lower(), self.distortion_model)
@@ -68,11 +74,17 @@ class EyeCalibration:
 
     @classmethod
     def of_rectified(
-        cls, width: int, height: int, P: ArrayLike, origin: str = 'calibration'
+        cls,
+        width: int,
+        height: int,
+        P: ArrayLike,
+        origin: str = 'calibration',
+        is_part: bool = False,
     ) -> EyeCalibration:
         """Return the calibration of images that are rectified already, with projection P (3, 4)."""
         matrix = np.asarray(P, np.float64).reshape(3, 4)
-        return cls(width, height, matrix[:, :3], np.zeros(5), np.eye(3), matrix, origin=origin)
+        K, straight = matrix[:, :3], np.eye(3)
+        return cls(width, height, K, np.zeros(5), straight, matrix, '', origin, is_part)
 
     @classmethod
     def of_raw(
@@ -82,6 +94,10 @@ class EyeCalibration:
         than its intrinsics (3, 3) and distortion.
         """
         return cls(*size, K, D, np.eye(3), np.hstack([K, np.zeros((3, 1))]), model, origin)
+
+    def rectified(self) -> EyeCalibration:
+        """Return the calibration of the rectified images."""
+        return self.of_rectified(self.width, self.height, self.P, self.origin, self.is_part)
 
     @property
     def is_straight(self) -> bool:
@@ -119,14 +135,21 @@ class EyeCalibration:
             raise CalibrationError(
                 f'{self.origin}: image size {self.width}x{self.height} is impossible'
             )
-        for name, matrix in (('K', self.K), ('P', self.P)):
+        for name, matrix in (('P', self.P), ('K', self.K)):
             if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
                 raise CalibrationError(
                     f'{self.origin}: {name}[0] = {matrix[0, 0]:g}, so the camera is not '
                     'calibrated; calibrate the pair first, e.g. with segfloor calibrate'
                 )
+            for (row, column), most in PINHOLE_ZEROS.items():
+                if abs(matrix[row, column] - (row == column)) > most:
+                    raise CalibrationError(
+                        f'{self.origin}: {name}[{row * matrix.shape[1] + column}] = '
+                        f'{matrix[row, column]:g}, so {name} holds a skew or a rotation, which no '
+                        'pinhole has; the rotation belongs to R; calibrate the pair again'
+                    )
         cx, cy = self.K[0, 2], self.K[1, 2]
-        if not (0 < cx < self.width and 0 < cy < self.height):
+        if not (self.is_part or (0 < cx < self.width and 0 < cy < self.height)):
             raise CalibrationError(
                 f'{self.origin}: the principal point ({cx:g}, {cy:g}) lies outside of the image of '
                 f'{self.width}x{self.height}; use the calibration of images of this size'
@@ -169,7 +192,14 @@ class StereoCalibration:
                 f'{right.width}x{right.height}; both eyes need the same size'
             )
         P = left.P
-        baseline_m = left.P[0, 3] / left.P[0, 0] - right.P[0, 3] / right.P[0, 0]
+        # P is f times the place of the left camera in the right one.
+        baseline_m, down_m = (P[i, 3] / P[i, i] - right.P[i, 3] / right.P[i, i] for i in (0, 1))
+        if abs(down_m) > SAME_ROWS * abs(baseline_m):
+            raise CalibrationError(
+                f'{right.origin}: P[3] and P[7] put the right camera {baseline_m:.3g} m beside and '
+                f'{abs(down_m):.3g} m {"below" if down_m > 0 else "above"} the left one; one above '
+                'the other is not supported: turn the pair, or calibrate it again'
+            )
         values = (float(v) for v in (P[0, 0], P[1, 1], P[0, 2], P[1, 2], baseline_m))
         try:
             camera = StereoCamera(left.width, left.height, *values)
@@ -195,11 +225,7 @@ class StereoCalibration:
 
     def rectified(self) -> StereoCalibration:
         """Return the calibration that belongs to the rectified images."""
-        eyes = (
-            EyeCalibration.of_rectified(eye.width, eye.height, eye.P, eye.origin)
-            for eye in (self.left, self.right)
-        )
-        return StereoCalibration(*eyes)
+        return StereoCalibration(self.left.rectified(), self.right.rectified())
 
     def check_size(self, width: int, height: int, what: str) -> None:
         """Raise CalibrationError unless images of `width` x `height` belong to this calibration."""
@@ -208,15 +234,3 @@ class StereoCalibration:
                 f'{what} is {width}x{height}, but {self.left.origin} is for images of '
                 f'{self.left.width}x{self.left.height}; use the calibration of these images'
             )
-
-
-def eye_calibration(info: Any, name: str) -> EyeCalibration:
-    """Return the calibration of one eye of a CameraInfo. name: of the topic, for messages. Raises
-    CalibrationError or InputError.
-    """
-    width, height = int(info.width), int(info.height)
-    if width * height > MAX_PIXELS:
-        raise InputError(f'{name}: a calibration of images of {width}x{height} pixels is not taken')
-    # ROS 1 names the matrices in capitals, ROS 2 does not.
-    K, D, R, P = (getattr(info, n if hasattr(info, n) else n.lower()) for n in 'KDRP')
-    return EyeCalibration(width, height, K, D, R, P, info.distortion_model, name)

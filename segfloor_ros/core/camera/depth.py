@@ -29,9 +29,7 @@ def depth_calibration(left: EyeCalibration) -> StereoCalibration:
     P = np.hstack([left.K, np.zeros((3, 1))])
     shift = np.array([[-left.K[0, 0] * VIRTUAL_BASELINE_M], [0.0], [0.0]])
     straight = dataclasses.replace(left, R=np.eye(3), P=P)
-    virtual = EyeCalibration.of_rectified(
-        left.width, left.height, np.hstack([left.K, shift]), left.origin
-    )
+    virtual = dataclasses.replace(straight, P=np.hstack([left.K, shift])).rectified()
     return StereoCalibration(straight, virtual)
 
 

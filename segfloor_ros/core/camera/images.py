@@ -32,6 +32,9 @@ CHANNELS = {
 """Channels by encoding, as in `sensor_msgs/image_encodings.hpp` and cv_bridge's generic names."""
 
 
+CLEARLY = 2.0
+"""Colours have so much less contrast than the brightness."""
+
 DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 
 DEPTH_HEADER = struct.Struct('<iff')
@@ -65,8 +68,11 @@ def colour_image(message: Any, name: str) -> Grey:
     if CHANNELS.get(encoding, 1) == 1 and not encoding.startswith('bayer_'):
         return grey_image(message, name)
     dtype = np.dtype(np.uint16 if '16' in encoding else np.uint8)
-    pixels = _unpacked(message, name, CHANNELS[encoding], dtype)
+    channels = CHANNELS[encoding]
+    pixels = _unpacked(message, name, channels, dtype)
     kind = encoding[6:10] if encoding.startswith('bayer_') else encoding.rstrip('0123456789UC')
+    if channels == 2:
+        kind = ('yuyv', 'uyvy')[_luma_of(pixels, encoding)]
     return cv2.cvtColor(pixels, TO_BGR[kind]) if kind in TO_BGR else pixels[:, :, :3]
 
 
@@ -115,6 +121,7 @@ def _unpacked(message: Any, name: str, channels: int, dtype: np.dtype[Any]) -> N
     width, height, step = int(message.width), int(message.height), int(message.step)
     check_size(width, height, name)
     row_bytes = width * channels * dtype.itemsize
+    step = step or row_bytes  # some drivers leave it out
     buffer = np.frombuffer(message.data, np.uint8)
     if width <= 0 or height <= 0 or step < row_bytes or buffer.size != step * height:
         raise CorruptImageError(
@@ -141,8 +148,7 @@ TO_BGR = {
     'rggb': cv2.COLOR_BayerBG2BGR, 'bggr': cv2.COLOR_BayerRG2BGR,
     'gbrg': cv2.COLOR_BayerGR2BGR, 'grbg': cv2.COLOR_BayerGB2BGR,
     'rgb': cv2.COLOR_RGB2BGR, 'rgba': cv2.COLOR_RGBA2BGR,
-    'yuv': cv2.COLOR_YUV2BGR_UYVY, 'uyvy': cv2.COLOR_YUV2BGR_UYVY,
-    'yuv422_yuy': cv2.COLOR_YUV2BGR_YUY2, 'yuyv': cv2.COLOR_YUV2BGR_YUY2,
+    'uyvy': cv2.COLOR_YUV2BGR_UYVY, 'yuyv': cv2.COLOR_YUV2BGR_YUY2,
 }  # fmt: skip
 """How encodings that are not BGR become it, by the encoding without its numbers."""
 
@@ -184,11 +190,21 @@ class EightBitScale:
 def _grey_of(pixels: Grey, encoding: str) -> Grey:
     if encoding.startswith('bayer_'):
         return cv2.cvtColor(pixels[:, :, 0], BAYER_CODES[encoding[6:10]])
-    if encoding in ('yuv422', 'uyvy'):
-        return pixels[:, :, 1].copy()
-    if encoding in ('yuv422_yuy2', 'yuyv'):
-        return pixels[:, :, 0].copy()
+    if CHANNELS[encoding] == 2:
+        return pixels[:, :, _luma_of(pixels, encoding)].copy()
     if encoding.startswith('rgb'):
         code = cv2.COLOR_RGBA2GRAY if pixels.shape[2] == 4 else cv2.COLOR_RGB2GRAY
         return cv2.cvtColor(pixels, code)
     return to_grey(pixels)
+
+
+def _luma_of(pixels: Grey, encoding: str) -> int:
+    """Return which of both channels (H, W, 2) is the brightness: that of the encoding unless it has
+    far less contrast than the other, as drivers mix UYVY and YUYV up. The colours U and V take
+    turns along a row.
+    """
+    declared = int(encoding in ('yuv422', 'uyvy'))
+    rows = pixels[::8].astype(np.float32)
+    contrast = (rows[:, ::2].std(axis=(0, 1)) + rows[:, 1::2].std(axis=(0, 1))).tolist()
+    is_mixed_up = contrast[1 - declared] > CLEARLY * contrast[declared]
+    return 1 - declared if is_mixed_up else declared

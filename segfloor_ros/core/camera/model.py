@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from segfloor_ros.core.errors import CalibrationError
 from segfloor_ros.core.geometry import Array
 
-MAX_BASELINE_M = 10.0
-"""No robot carries eyes farther apart; a baseline in millimetres is larger."""
+BASELINES_M = 0.002, 10.0
+"""No robot's eyes are nearer to each other or farther apart; lengths in another unit are."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ class StereoCamera:
                 f'baseline is {self.baseline_m:g} m, it must be positive: '
                 'are left and right swapped, or is P[3] of the right camera missing?'
             )
-        if self.baseline_m > MAX_BASELINE_M:
+        if not BASELINES_M[0] <= self.baseline_m <= BASELINES_M[1]:
             raise CalibrationError(
-                f'baseline is {self.baseline_m:g} m; are lengths in millimetres? They must be in '
-                'metres: P[3] of the right camera is -fx times the baseline'
+                f'baseline is {self.baseline_m:g} m; are lengths in millimetres, or divided twice? '
+                'They must be in metres: P[3] of the right camera is -fx times the baseline'
             )
         if self.width <= 0 or self.height <= 0:
             raise CalibrationError(f'image size {self.width}x{self.height} is impossible')

@@ -48,18 +48,19 @@ class StereoCameraSettings(StageSettings):
     )
     left_image_topic: str = setting('', 'Left image topic in a bag; empty: found by its name.')
     right_image_topic: str = setting('', 'Right image topic in a bag; empty: found by its name.')
-    wheel_odometry_topic: str = setting(
-        '', 'Wheel odometry topic in a bag; empty: found by its type.'
-    )
+    wheel_odometry_topic: str = setting('', 'Wheel odometry topic of a bag; empty: by its type.')
     depth: bool = setting(
         False,
         'Take depth images in place of the right ones; without right images it is done anyway.',
     )
+    depth_scale: float = setting(
+        0.0,
+        'Metres of one unit of depth images; 0: 0.001 of whole numbers, 0.0002 of TUM RGB-D.',
+        within=(0.0, 1.0),
+    )
     depth_topic: str = setting('', 'Depth image topic in a bag; empty: found by its name.')
     imu_topic: str = setting('', 'IMU topic in a bag; empty: found by its type.')
-    ignore: str = setting(
-        '', 'Sensors of the recording to leave out, with commas: wheel_odometry, imu.'
-    )
+    ignore: str = setting('', 'Sensors to leave out, with commas: wheel_odometry, imu.')
 
     masks: str = setting(
         '',

@@ -5,10 +5,12 @@ words parted by blanks or commas.
 from __future__ import annotations
 
 import json
+import logging
 import math
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from datetime import datetime
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.errors import InputError, SegfloorError
+
+logger = logging.getLogger(__name__)
 
 MAX_BYTES = 1 << 28
 """Of a file that is read whole: an hour of an IMU at 1 kHz has about as many."""
@@ -91,10 +95,56 @@ def number(word: str) -> float:
     return value
 
 
-def nanoseconds(seconds: str) -> int:
-    """Return a time in seconds, as text, in ns, exactly. Raises ValueError for what is no stamp."""
-    value = Decimal(seconds) if -1 < number(seconds) < 1e10 else Decimal(-1)
-    return checked_ns(int(value.scaleb(9).to_integral_value()), seconds)
+def nanoseconds(time: str, digits: int = 0) -> int:
+    """Return a time, as text, in ns, exactly. digits: as `digits_of`. Raises ValueError for what is
+    no stamp.
+    """
+    value = Decimal(time) if -1 < number(time) < 10 ** (10 + digits) else Decimal(-1)
+    return checked_ns(int(value.scaleb(9 - digits).to_integral_value()), time)
+
+
+_UNITS = ((3, 'ms', 20, 1e11), (6, 'µs', 3e3, 1e14), (9, 'ns', 3e6, 1e17))
+"""Units of time: their digits below one second, name, the step from row to row and the time from
+which on a time is one in this unit: 20 s to 3,000 ms are no step of a robot, 1e11 s is no date."""
+
+
+def digits_of(times: Iterable[str], where: str) -> int:
+    """Return how many digits below a second the unit of times has, as they are written: 0 for
+    seconds, 9 for ns. Those without fraction in large steps, or beyond all dates, are in ms, µs or
+    ns; a warning says so.
+    """
+    words = list(times)
+    try:
+        values = np.array([number(word) for word in words])
+    except ValueError:
+        return 0  # its line is named where it is read
+    steps = np.diff(values)
+    is_whole = all('.' not in word or 'e' in word.lower() for word in words)
+    step = float(np.median(steps)) if len(steps) and is_whole else 0.0
+    latest = float(values.max(initial=0.0))
+    fitting = [unit for unit in _UNITS if step >= unit[2] or latest >= unit[3]]
+    if not fitting:
+        return 0
+    digits, name, *_ = fitting[-1]
+    logger.warning('%s: its times are read as %s: they are up to %.3g', where, name, latest)
+    return digits
+
+
+_DATE = re.compile(r'(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(\.\d+)?')
+
+
+def time_of(line: str) -> str:
+    """Return the time that a line begins with as a number, as text; a date and time of day, as in
+    KITTI's raw recordings, in seconds since 1970.
+    """
+    found = _DATE.match(line.strip())
+    if found is None:
+        return line.replace(',', ' ').split()[0]
+    try:
+        then = datetime.fromisoformat(f'{found[1]}T{found[2]}+00:00')
+    except ValueError:
+        return found[0]
+    return f'{int(then.timestamp())}{found[3] or ""}'
 
 
 def whole_nanoseconds(word: str) -> int:

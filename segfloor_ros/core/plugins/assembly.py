@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.contracts import Mount
+from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.floor.plane.mount import MountEstimator
 from segfloor_ros.core.pipeline import KeyframeListener, KeyframeStages, Pipeline
 from segfloor_ros.core.plugins.maps.session import MapSession
@@ -33,7 +35,8 @@ def make_slam(
     """Build stereo SLAM with the camera's mount: `mount` when it is known (from tf), else from
     the settings, and whatever the settings leave open is measured from the floor the camera
     sees. CAMERA_AS_BASE: it is measured, too, and tracking is the same, but results wait for none
-    and have the axes of the camera. background: adjust the map beside tracking.
+    and have the axes of the camera. background: adjust the map beside tracking. Raises InputError
+    for an impossible mount.
     """
     base = mount if mount is CAMERA_AS_BASE else None
     mount = None if mount is base else mount
@@ -57,10 +60,38 @@ def make_slam(
             left_m=settings.camera_left_m,
         )
     else:
+        check_mount(mount)
         meter = MountEstimator(camera, forward_m=mount.forward_m, left_m=mount.left_m, given=mount)
     slam = equipped_slam(camera, settings, mount, meter, times, background)
     slam.rig.base = base
     return slam
+
+
+LEAST_HEIGHT_M, MOST_UP_RAD, MOST_ROLL_RAD = 0.02, math.radians(30), math.radians(60)
+"""A camera that maps a floor is above it, and sees it upright."""
+
+
+def check_mount(mount: Mount) -> None:
+    """Raise InputError where a camera cannot be mounted so."""
+    pitch, roll = math.degrees(mount.pitch_rad), math.degrees(mount.roll_rad)
+    place_m = mount.height_m, mount.forward_m, mount.left_m
+    if not any(place_m) and pitch < -89.0:  # x and z of a frame are those of the camera
+        raise InputError(
+            'the frame of the base is the camera itself; set base_frame to the frame of the robot '
+            'on the floor, e.g. base_link'
+        )
+    if -mount.pitch_rad > MOST_UP_RAD or abs(mount.roll_rad) > MOST_ROLL_RAD:
+        raise InputError(
+            f'the camera would look down by {pitch:.0f} deg and be rolled by {roll:.0f} deg: its '
+            'frame is no optical one (x right, y down, z ahead; REP-103); let its driver stamp the '
+            'images with the optical frame, and put that below its body with roll -90, yaw -90 deg'
+        )
+    if mount.height_m < LEAST_HEIGHT_M:
+        raise InputError(
+            f'the camera would be {mount.height_m:.3f} m above the floor, on which the base frame '
+            'lies; correct the height in the transform, or set base_frame to a frame on the floor, '
+            'e.g. base_footprint'
+        )
 
 
 def equipped_slam(

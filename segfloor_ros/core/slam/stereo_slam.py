@@ -224,7 +224,7 @@ class StereoSlam:
                 return
             if track is not None and self.mount is not None:
                 result = in_map(self._result(frame, track, '', None), self.mount.T_base_left)
-                self.announce(result, frame, images.excluded)
+                self.announce(result, frame, images.moving)
 
         # Not early where the map may move before, nor after a frame that did not become one.
         is_late = self.back_end.holds_one(of_all=True) or self._shows_nothing
@@ -267,7 +267,7 @@ class StereoSlam:
         else:
             self.back_end.take_in(keyframe, images, self.sensors.up_world)
         self.front_end.continue_from(images, keyframe)
-        return take_snapshot(self.map, keyframe, frame, images.excluded)
+        return take_snapshot(self.map, keyframe, frame, images.moving)
 
     def _result(
         self, frame: StereoFrame, track: Track | None, fault: str, keyframe: Keyframe | None

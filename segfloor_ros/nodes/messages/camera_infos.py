@@ -34,23 +34,20 @@ def camera_info_message(
 
 
 def same_calibration(a: Message, b: Message) -> bool:
-    """Return whether two messages hold the same calibration."""
-    sizes = ((a.width, a.height), (b.width, b.height))
-    return (
-        sizes[0] == sizes[1]
-        and a.distortion_model == b.distortion_model
-        and all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ('d', 'k', 'r', 'p'))
+    """Return whether two messages hold the same calibration, of the same part of the image."""
+    plain = ('width', 'height', 'distortion_model', 'binning_x', 'binning_y', 'roi')
+    return all(getattr(a, name) == getattr(b, name) for name in plain) and all(
+        np.array_equal(getattr(a, name), getattr(b, name)) for name in ('d', 'k', 'r', 'p')
     )
 
 
 def rectified_calibration(camera: StereoCamera) -> StereoCalibration:
     """Return the calibration of rectified images of a camera."""
-    P = np.zeros((3, 4))
-    P[:, :3] = camera.K
-    left = EyeCalibration.of_rectified(camera.width, camera.height, P)
+    P = np.hstack([camera.K, np.zeros((3, 1))])
+    size = camera.width, camera.height
+    left = EyeCalibration.of_rectified(*size, P, is_part=True)
     P[0, 3] = -camera.disparity_times_depth
-    right = EyeCalibration.of_rectified(camera.width, camera.height, P)
-    return StereoCalibration(left, right)
+    return StereoCalibration(left, EyeCalibration.of_rectified(*size, P, is_part=True))
 
 
 def compressed_message(

@@ -4,7 +4,6 @@ listens to, topics that do not connect, or look like one that nobody publishes; 
 
 from __future__ import annotations
 
-import difflib
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -44,14 +43,6 @@ from segfloor_ros.nodes.messages.topics import (
 
 if TYPE_CHECKING:
     from segfloor_ros.nodes.shared.joining import StampJoiner
-
-MOST = 3
-
-SIDES = {
-    'left': ('left', 'infra1', 'ir_left', 'cam0'),
-    'right': ('right', 'infra2', 'ir_right', 'cam1'),
-}
-"""How drivers call the two sides."""
 
 
 class LossCounter:
@@ -282,30 +273,6 @@ def _remedy(node: Node, offered: QoSProfile, wanted: QoSProfile) -> str:
     return 'let it publish reliable'
 
 
-def lookalikes(node: Node, topic: str, kind: str) -> list[str]:
-    """Return the published topics of a type, e.g. `sensor_msgs/msg/Image`, that look most like a
-    full topic name; those of the other side of a stereo pair last, none that these nodes make.
-    """
-    own = tuple(f'/{one.name}' for one in TOPICS.values() if one.publisher in NODES[1:])
-    found = [
-        name
-        for name, kinds in node.get_topic_names_and_types()
-        if kind in kinds and not name.endswith(own) and node.count_publishers(name)
-    ]
-    return sorted(found, key=lambda name: -likeness(topic, name))[:MOST]
-
-
-def likeness(wanted: str, name: str) -> float:
-    """Return how much a topic's name looks like another: by its letters, and by its side."""
-    score = difflib.SequenceMatcher(None, wanted.lower(), name.lower()).ratio()
-    for side, words in SIDES.items():
-        if side in wanted:
-            score += any(word in name.lower() for word in words)
-            others = (word for other, them in SIDES.items() if other != side for word in them)
-            score -= any(word in name.lower() for word in others)
-    return score
-
-
 def in_words(names: Sequence[str]) -> str:
     """Return names as a list in words."""
     return ', '.join(names[:-1]) + ' and ' * (len(names) > 1) + names[-1] if names else 'nothing'
@@ -402,6 +369,8 @@ class Connections:
             return f'{topic} is published as {in_words(sorted(others))}, not as {kind}'
         if TOPICS[name].publisher in NODES[1:]:
             return f'{topic} is what {TOPICS[name].publisher} publishes'
+        from segfloor_ros.nodes.watches.lookalikes import lookalikes  # of what others publish
+
         found = lookalikes(self._node, topic, kind)
         if not found:
             return f'{topic}: no other topic of the type {kind} is published'

@@ -152,27 +152,23 @@ def run_nodes(make_nodes: Callable[[], Sequence[Node]]) -> None:
 
 
 def descriptor(spec: SettingSpec) -> ParameterDescriptor:
-    """Return the descriptor of a setting. The type stays open, so that `1` is taken for 1.0 as on
-    the command line; the check of the setting decides.
+    """Return the descriptor of a setting. The type stays open, so that the check of the setting
+    says what is wrong.
     """
-    unit = f' [{spec.unit}]' if spec.unit else ''
     result = ParameterDescriptor(
         name=spec.name,
-        description=spec.description + unit,
+        description=spec.description + (f' [{spec.unit}]' if spec.unit else ''),
         additional_constraints=spec.range_text(),
         read_only=not spec.live,
         dynamic_typing=True,
     )
-    if spec.within is None:
-        return result
-    low, high = spec.within
-    if spec.type is int:
+    low, high = spec.within or (0, 0)
+    if spec.type is int and spec.within:
         result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
     # rclpy holds not-a-number ("to be measured") to be out of every range.
-    if spec.type is float and spec.default == spec.default:
-        result.floating_point_range = [
-            FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)
-        ]
+    elif spec.within and spec.default == spec.default:
+        ends = {'from_value': float(low), 'to_value': float(high)}
+        result.floating_point_range = [FloatingPointRange(**ends, step=0.0)]
     return result
 
 
@@ -191,7 +187,18 @@ class NodeParameters(Generic[Settings]):
         for spec in settings.specs():
             value = getattr(self.settings, spec.name)
             node.declare_parameter(spec.name, value, descriptor(spec), True)
+        node.add_pre_set_parameters_callback(self._with_fractions)
         node.add_on_set_parameters_callback(self._change)
+
+    def _with_fractions(self, parameters: Sequence[Parameter]) -> list[Parameter]:
+        """Return parameters with `1` as 1.0 where the parameter has fractions."""
+        types = {spec.name: spec.type for spec in self.settings.specs()}
+        return [
+            Parameter(p.name, value=float(p.value))
+            if types.get(p.name) is float and type(p.value) is int
+            else p
+            for p in parameters
+        ]
 
     def _change(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         """Take over new values of live parameters, or none of them with the reason."""
@@ -214,7 +221,7 @@ class NodeParameters(Generic[Settings]):
             if name.partition('.')[0] not in ROS_PARAMETERS
         ]
         given = {name: node.get_parameter(name).value for name in names}
-        self._refuse_unknown(given)
+        self._refuse_unknown(given, node)
         given.update(self._command_line())
         self._replace(given)
         for name in given:
@@ -229,9 +236,11 @@ class NodeParameters(Generic[Settings]):
         assigned = command_line_parameters(sys.argv)
         return {name: _parsed(assigned[name], specs[name]) for name in assigned & specs.keys()}
 
-    def _refuse_unknown(self, given: Mapping[str, Any]) -> None:
-        from segfloor_ros.nodes.configuration import NODE_SETTINGS  # of all nodes
+    def _refuse_unknown(self, given: Mapping[str, Any], owner: Node) -> None:
+        from segfloor_ros.nodes.configuration import NODE_SETTINGS, unread_sections  # of all nodes
 
+        for line in unread_sections(sys.argv, owner.get_fully_qualified_name()):
+            owner.get_logger().warning(line)
         known = [spec.name for spec in self.settings.specs()]
         for name in given:
             # A section `/**` of a parameter file reaches every node; names of other nodes are fine.

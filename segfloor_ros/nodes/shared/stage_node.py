@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from inspect import isawaitable
 from typing import Any, Generic, TypeVar
 
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, ManagedEntity, TransitionCallbackReturn
@@ -305,6 +306,12 @@ class StageNode(LifecycleNode, ABC, Generic[Settings]):
     def settings(self) -> Settings:
         """The node's parameters as they are now."""
         return self.parameters.settings
+
+    def describe_parameter(self, name: str) -> ParameterDescriptor:
+        """Return a descriptor with the type of the value: rclpy notes that of any value tried."""
+        described = super().describe_parameter(name)
+        described.type = self.get_parameter(name).type_.value
+        return described
 
     def reset(self, reason: str) -> None:
         """Drop the map and begin with an empty one, with one line in the log."""

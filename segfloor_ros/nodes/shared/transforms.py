@@ -2,102 +2,24 @@
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections import deque
 from collections.abc import Callable
-from functools import partial
-from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 
 from segfloor_ros.core.contracts import FrameResult, Mount
-from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import Array, invert
-from segfloor_ros.nodes.frame_tree import FrameTree
-from segfloor_ros.nodes.messages.poses import transform_array, transform_message
-from segfloor_ros.nodes.messages.topics import (
-    IMAGES,
-    KEYFRAMES,
-    LATCHED,
-    LATCHED_BY_MANY,
-    PATIENCE_S,
-    to_ns,
-)
+from segfloor_ros.nodes.messages.poses import transform_message
+from segfloor_ros.nodes.messages.topics import IMAGES, PATIENCE_S
 from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import LOOK_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
+from segfloor_ros.nodes.shared.tf_link import TfLink
 
 DISCOVERY_S = 1.0
 """Who publishes tf is known so long after the start; where nobody does, tf is not waited for."""
-
-
-class TfLink:
-    """What other nodes broadcast, in `frames`, and the way to broadcast oneself. Where tf2_msgs is
-    not installed, no frame is ever known and nothing is sent.
-    """
-
-    def __init__(self, node: AnyStageNode) -> None:
-        self.frames = FrameTree()
-        self.is_there = importlib.util.find_spec('tf2_msgs') is not None
-        self._node = node
-        self._outputs: dict[str, Any] = {}
-        self._stop: list[Callable[[], Any]] = []
-        if self.is_there:
-            self._connect()
-
-    def send(self, *transforms: TransformStamped) -> None:
-        """Broadcast transforms at one time."""
-        self._publish('/tf', transforms)
-
-    def send_fixed(self, transform: TransformStamped) -> None:
-        """Broadcast a transform that holds from now on."""
-        self._publish('/tf_static', (transform,))
-
-    def listener_count(self) -> int:
-        """Return how many others listen to moving frames."""
-        moving = self._outputs.get('/tf')
-        return 0 if moving is None else moving.get_subscription_count() - bool(self._stop)
-
-    def stop_listening(self) -> None:
-        """Read no more."""
-        while self._stop:
-            self._stop.pop()()
-
-    def _connect(self) -> None:
-        """Publish and subscribe whether the node is active or not, until it is cleaned up."""
-        from tf2_msgs.msg import TFMessage
-
-        self._type: Any = TFMessage
-        node = self._node
-        for topic, sent, heard in (
-            ('/tf', KEYFRAMES, KEYFRAMES),
-            ('/tf_static', LATCHED, LATCHED_BY_MANY),
-        ):
-            output = self._outputs[topic] = node.create_publisher(TFMessage, topic, sent)
-            node.outputs.at_clean_up(partial(node.destroy_publisher, output))
-            take = partial(self._take, topic == '/tf_static')
-            made = node.create_subscription(TFMessage, topic, take, heard)
-            self._stop.append(partial(node.destroy_subscription, made))
-        node.outputs.at_clean_up(self.stop_listening)
-
-    def _publish(self, topic: str, transforms: tuple[TransformStamped, ...]) -> None:
-        if self.is_there:
-            self._outputs[topic].publish(self._type(transforms=list(transforms)))
-
-    def _take(self, is_fixed: bool, message: Any) -> None:
-        for found in message.transforms:
-            parent, child = found.header.frame_id, found.child_frame_id
-            try:
-                if is_fixed:
-                    self.frames.add_fixed(parent, child, transform_array(found))
-                else:
-                    stamp_ns = to_ns(found.header.stamp)
-                    self.frames.add_moving(stamp_ns, parent, child, transform_array(found))
-            except InputError as error:
-                text = f'tf from {parent} to {child}: {error}'
-                self._node.reporter.diagnose(f'{parent} {child}', text, lasts_s=PATIENCE_S)
 
 
 class Transforms:
@@ -109,15 +31,19 @@ class Transforms:
     so that whoever looks up map → base_link finds it as fresh as the odometry.
     """
 
-    def __init__(self, node: AnyStageNode) -> None:
+    def __init__(
+        self, node: AnyStageNode, on_heard: Callable[[TransformStamped], None] | None = None
+    ) -> None:
         own: StereoSlamNodeSettings = node.settings
         self._node = node
         self._own = own
-        self._link = TfLink(node)
+        self._link = TfLink(node, on_heard)
+        self._publishers = 0
         self._tf = self._link.frames
         self._opened_s = self._deadline_s = 0.0
         self._mounted: tuple[str, Array] | None = None
         self._unsent_mount: tuple[int, str, Mount] | None = None
+        self._is_announced = False
         self._uncorrected: deque[FrameResult] = deque(maxlen=IMAGES.depth)
         self._T_map_odom: Array | None = None
         self._corrected_ns = 0
@@ -200,15 +126,22 @@ class Transforms:
     def announce_mount(self, stamp_ns: int, camera_frame: str, mount: Mount) -> None:
         """Broadcast the mount in use where tf lacks it, once tf had its time to tell."""
         self._unsent_mount = stamp_ns, camera_frame, mount
+        self._is_announced = True
 
     def _advance(self) -> None:
+        publishers = self._node.count_publishers('/tf') + self._node.count_publishers('/tf_static')
+        if publishers > self._publishers and self._own.publish_tf:  # which may be rivals
+            self._link.listen()
+            self._deadline_s = max(self._deadline_s, time.monotonic() + PATIENCE_S)
+        self._publishers = publishers
         if self._unsent_mount is not None and time.monotonic() >= self._deadline_s:
             if self._own.publish_tf:
                 self._broadcast_mount(*self._unsent_mount)
             self._unsent_mount = None
-            # A fused odometry is listened to on and on.
-            if not self._is_fused:
-                self._link.stop_listening()
+        # A fused odometry is listened to on and on.
+        has_mount = self._is_announced and self._unsent_mount is None
+        if has_mount and not self._is_fused and time.monotonic() >= self._deadline_s:
+            self._link.stop_listening()
         if self._is_fused:
             self._correct()
 

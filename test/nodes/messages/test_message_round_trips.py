@@ -7,7 +7,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sampled_poses import assert_spread, drawn_errors, uneven_covariance
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration, eye_calibration
+from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.core.camera.camera_info import eye_calibration
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import (
     POINT_FLOOR,

@@ -74,6 +74,13 @@ no measurement."""
 WHITE_SHARE = 1 / 3
 """Lamps, windows and the sky whiten less."""
 
+NO_RIG_PX = 5.0
+"""Rows between both eyes change by less while a rig is driven, however badly it is rectified."""
+
+NEAREST_M, NEAREST_PERCENT = (0.25, 4.0), 95
+"""The nearest twentieth of what a depth camera of a robot measures is farther than it reaches down
+to, and no farther than the floor or the walls around it; other figures have another unit."""
+
 SAME_EYES, EYES_RATIO = 1.07, 1.25
 """Two good cameras with exposures of their own differ by up to the one; the other is a fault."""
 
@@ -102,11 +109,25 @@ FAULTS = {
         'show different things: {value:.0f}% of the points of one are found in the other',
         'check that both are of one camera, none of them turned, mirrored or of another time',
     ),
+    'no_rig': (
+        'px',
+        'are of no stereo camera: the same points are {value:.0f} rows further apart in one pair '
+        'than in another',
+        'take two cameras on one rigid mount that are triggered together; two phones or webcams '
+        'side by side are none',
+    ),
     'depth_unaligned': (
         'px',
         'are not aligned: the edges of depth fit those of the image best moved by {value:.0f} px '
         'and {scale:.2f} times as large',
         'give depth that is registered to the image (aligned_depth_to_color, depth_registered)',
+    ),
+    'depth_scale': (
+        'm',
+        'do not fit: the nearest depths are {value:.2g} m, those of a robot are '
+        f'{NEAREST_M[0]:g} to {NEAREST_M[1]:g} m',
+        'set stereo_camera.depth_scale to the metres of one unit of depth (0.001 for mm, 0.0002 in '
+        'the TUM RGB-D benchmark), or let the driver publish 16UC1 in mm or 32FC1 in m',
     ),
     'not_simultaneous': (
         'ms',
@@ -151,7 +172,7 @@ FAULTS = {
 }
 """Of each fault its unit, what was found, and what to do."""
 
-BENT = {'rows_apart', 'eyes_swapped', 'same_image', 'different_views', 'not_simultaneous'}
+BENT = {'no_rig', 'rows_apart', 'eyes_swapped', 'same_image', 'different_views', 'not_simultaneous'}
 """Images with these faults show a world that is bent, whatever the calibration."""
 
 
@@ -180,6 +201,7 @@ class RigCheck:
         self._last_ns = 0
         self._steps_ns: deque[int] = deque(maxlen=SETTLED_FRAMES)
         self._depth = DepthCheck()
+        self._nearest_px: deque[float] = deque(maxlen=RECENT)
         self._calibration = CalibrationCheck(camera)
 
     @timed
@@ -215,6 +237,7 @@ class RigCheck:
             self._images = 'image and depth'
             if is_look:
                 self._pictures.append(_picture([frame.left]))
+                self._judge_scale(frame.right)
                 self._judge_depth(frame)
                 self._judge_pictures()
         elif is_look or (self.frames % EVERY == EVERY // 2 and not self._calibration.is_done):
@@ -259,6 +282,8 @@ class RigCheck:
 
     def _found_lag(self, lag_s: float, frame_s: float, late: str, early: str) -> None:
         """Note that one kind of image is late, or early where the lag is negative."""
+        if 'not_simultaneous' in self.faults:  # it is said once, and with one figure
+            return
         late, early = (late, early) if lag_s > 0 else (early, late)
         lag_ms, frames = 1e3 * abs(lag_s), abs(lag_s) / frame_s
         self._found(
@@ -318,11 +343,19 @@ class RigCheck:
         return guess._replace(right_px=np.asarray(right_px, np.float32)).those(found)
 
     def _judge(self) -> None:
+        if 'no_rig' in self.faults:
+            return
         seen = np.concatenate(self._looks)
         points = sum(self._points)
         if len(seen) < max(MIN_MATCHES, FOUND_SHARE * points):
             if len(self._looks) == RECENT and min(self._points) >= MIN_MATCHES:
                 self._found('different_views', 100 * len(seen) / points)
+            return
+        if len(self._looks) == RECENT and (change_px := self._change_px()) > NO_RIG_PX:
+            self._mend = None
+            for bent in BENT & self.faults.keys():
+                del self.faults[bent]
+            self._found('no_rig', change_px)
             return
         followed = seen[np.isfinite(seen).all(axis=1)]
         lag_s = self._lag_s(followed)
@@ -371,6 +404,22 @@ class RigCheck:
         if offset_px is not None:
             self._found('principal_points', offset_px)
 
+    def _change_px(self) -> float:
+        """Return by how many rows the distance between both eyes changes from look to look, as far
+        as points of one look agree, without what one lag explains.
+        """
+        enough = [look for look in self._looks if len(look) >= MIN_MATCHES]
+        if len(enough) < RECENT - 1:
+            return 0.0
+        apart = []
+        lag = self._lag_s(np.concatenate([look[np.isfinite(look).all(axis=1)] for look in enough]))
+        for look in enough:
+            rows_px = look[:, 3] - lag * np.nan_to_num(look[:, 5])
+            apart.append((float(np.median(rows_px)), spread_px(rows_px)))
+        middles, spreads = np.array(apart).T
+        change_px = float(np.ptp(middles))
+        return change_px if change_px > SURE * float(np.median(spreads)) else 0.0
+
     def _judge_pictures(self) -> None:
         if len(self._pictures) < RECENT:
             return
@@ -383,6 +432,16 @@ class RigCheck:
             self._found('blurred', edge_px)
         if white_share > WHITE_SHARE:
             self._found('saturated', 100 * white_share)
+
+    def _judge_scale(self, disparity: NDArray[np.float32]) -> None:
+        measured = disparity[::4, ::4][disparity[::4, ::4] > 0]
+        if len(measured) < MIN_MATCHES:
+            return
+        self._nearest_px.append(float(np.percentile(measured, NEAREST_PERCENT)))
+        nearest_m = self._camera.disparity_times_depth / float(np.median(self._nearest_px))
+        self.faults.pop('depth_scale', None)
+        if not NEAREST_M[0] <= nearest_m <= NEAREST_M[1]:
+            self._found('depth_scale', nearest_m)
 
     def _judge_depth(self, frame: StereoFrame) -> None:
         if self._before is None:

@@ -300,7 +300,8 @@ class FrontEnd:
         if region is None:
             return images
         self.follower.drop_inside(region)
-        return replace(images, excluded=union(images.excluded, region))
+        excluded, moving = (union(known, region) for known in (images.excluded, images.moving))
+        return replace(images, excluded=excluded, moving=moving)
 
     @timed
     def observe(

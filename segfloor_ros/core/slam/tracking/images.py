@@ -83,8 +83,8 @@ Matches = tuple[NDArray[np.intp], NDArray[np.intp]]
 class Images:
     """left, right: rectified grey images (H, W) float32, for patches; of a depth camera its
     disparity for the right one, and depth_scale: disparity times depth, 0 of a stereo pair. small:
-    the left one as optical flow takes it. excluded: where something moves, in the left image, and
-    the black border that rectification leaves.
+    the left one as optical flow takes it. moving: where something moves, in the left image;
+    excluded: there, and in the black border that rectification leaves.
     """
 
     left: NDArray[np.float32]
@@ -92,6 +92,7 @@ class Images:
     small: NDArray[np.uint8]
     excluded: Region | None = None
     depth_scale: float = 0.0
+    moving: Region | None = None
 
     @staticmethod
     def of(
@@ -105,10 +106,9 @@ class Images:
         """
         depth_scale = camera.disparity_times_depth if is_disparity(frame.right) else 0.0
         left, right = frame.left.astype(np.float32), frame.right.astype(np.float32)
-        excluded = border
-        if frame.excluded is not None:
-            excluded = union(excluded, dilate(frame.excluded, mask_dilation_px))
-        return Images(left, right, shrink(frame.left), excluded, depth_scale)
+        said = frame.excluded
+        moving = None if said is None else dilate(said, mask_dilation_px)
+        return Images(left, right, shrink(frame.left), union(border, moving), depth_scale, moving)
 
 
 def shrink(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

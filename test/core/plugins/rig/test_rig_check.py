@@ -87,6 +87,30 @@ def test_rows_that_are_off_are_taken_off_the_right_image(frames) -> None:
     assert np.median(error) <= 1  # interpolated between rows where it is not exactly 3
 
 
+def with_rows(frames: list[StereoFrame], rows: Callable[[int], float]) -> list[StereoFrame]:
+    return [replace(f, right=np.roll(f.right, round(rows(f.index)), axis=0)) for f in frames]
+
+
+@pytest.mark.parametrize('seed', [1, 2])
+def test_two_cameras_that_move_against_each_other_are_no_rig(frames, seed) -> None:
+    shake_px = np.random.default_rng(seed).uniform(-10, 10, SETTLED_FRAMES // EVERY + 1)
+    found = faults(with_rows(frames, lambda i: shake_px[i // EVERY]))
+    assert set(found) == {'no_rig'}
+    # Of the frames that are looked at, every tenth one.
+    assert found['no_rig'].value == pytest.approx(np.ptp(np.rint(shake_px[:RECENT])), abs=0.5)
+    assert 'are of no stereo camera' in found['no_rig'].line()
+
+
+def test_the_figure_of_a_lag_stays_as_it_was_said(frames) -> None:
+    check, said = RigCheck(CAMERA), set()
+    room = StereoRoom(seed=5)
+    more = [room.frame(i, pose(i)) for i in range(2 * SETTLED_FRAMES)]
+    for frame in late(more, 1.0):
+        check.see(frame)
+        said |= {fault.line() for fault in check.faults.values()}
+    assert len(said) == 1
+
+
 def test_eyes_that_are_exchanged_are_named(frames) -> None:
     found = faults([replace(f, left=f.right, right=f.left) for f in frames])
     assert set(found) == {'eyes_swapped'}
