@@ -23,8 +23,8 @@ from segfloor_ros.nodes.messages.diagnostics import HEALTH, Level
 from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.topics import FRAMES, IMAGES, SLAM, TOPICS, to_time
 from segfloor_ros.nodes.shared import reporter
-from segfloor_ros.nodes.watches.lookalikes import likeness
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
+from segfloor_ros.nodes.watches.lookalikes import likeness
 
 GIVEN = (
     '-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
