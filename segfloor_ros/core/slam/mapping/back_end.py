@@ -118,7 +118,7 @@ class BackEnd:
         self.reset_places()
 
     def reset_places(self, words: Arrays | None = None) -> None:
-        """Believe in no place of the map, which is another one now. words: of its keyframes."""
+        """Forget places and loops: the map is another one now. words: of its keyframes."""
         self._global.reset()
         self.places.reset()
         self.loops.reset()

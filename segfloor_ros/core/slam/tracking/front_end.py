@@ -185,7 +185,8 @@ class FrontEnd:
             # No farther than a robot can have driven since its last frame.
             way_m = greatest_speed_mps(self._map.keyframes) * 1e-9 * (frame.stamp_ns - seen_ns)
             step = found.T_camera_world @ invert(self.motion.T_camera_world)
-            found = found if is_within(step, (SAME[0] + way_m, math.inf)) else None
+            if not is_within(step, (SAME[0] + way_m, math.inf)):
+                return None
         return found
 
     def _standing(

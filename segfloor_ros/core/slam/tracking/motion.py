@@ -10,19 +10,9 @@ from segfloor_ros.core.contracts import BodySensors, LastPose, RelativeMotion
 from segfloor_ros.core.geometry import Array, invert, make_transform
 from segfloor_ros.core.slam.thresholds import SAME, SPEED_SIGMA
 from segfloor_ros.core.slam.tracking.pose import ANYWHERE, PoseEstimate, knows_more
-from segfloor_ros.core.twists import (
-    Uncertain,
-    compounded,
-    is_within,
-    se3_exp,
-    se3_log,
-    without_drift,
-)
+from segfloor_ros.core.twists import Uncertain, compounded, se3_exp, se3_log, without_drift
 
 MIN_STEP_S = 1e-3
-
-MAX_TURN_RADPS = 6.0
-"""A robot does not spin faster than once a second."""
 
 ACCELERATION = 2.0
 """Of a robot on wheels, m/s² and rad/s², until its motion shows another one."""
@@ -148,7 +138,7 @@ class CameraMotion:
             return True
         motion = T_camera_world @ invert(self.T_camera_world)
         step_s = _step_s(self._last_stamp_ns, stamp_ns)
-        return is_within(motion, (self._max_speed_mps * step_s, MAX_TURN_RADPS * step_s))
+        return bool(np.linalg.norm(motion[:3, 3]) <= self._max_speed_mps * step_s)
 
     def knows_more(self, by_images: PoseEstimate, stamp_ns: int) -> bool:
         """Whether sensors know some direction of a pose better than the images: wheels since the

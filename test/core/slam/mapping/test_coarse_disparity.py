@@ -6,10 +6,11 @@ import pytest
 from hand_made_maps import CAMERA
 
 from segfloor_ros.core.contracts import NO_POINT, StereoFrame
-from segfloor_ros.core.slam.mapping.keyframe_mapping import LocalMapper, guess_disparity
+from segfloor_ros.core.slam.mapping.keyframe_mapping import LocalMapper
 from segfloor_ros.core.slam.rig import Observations, Rig
 from segfloor_ros.core.slam.sparse_map import SparseMap
 from segfloor_ros.core.slam.tracking.images import Features, Images
+from segfloor_ros.core.slam.tracking.patch_alignment import guess_disparity
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures
 
 

@@ -87,10 +87,10 @@ def test_free_space_does_not_run_through_what_stands_there():
 )
 def test_three_keyframes_on_the_move_must_show_the_same_drift(views, drifts_m, expected):
     sparse_map = row_of_views(26, list(range(10)), 0.1)
-    sightings = matcher(sparse_map)
+    sightings = matcher(sparse_map).sightings
     for index, drift_m in zip(views, drifts_m, strict=True):
         drift = se3_exp(np.array([drift_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
         pose = sparse_map.keyframes[index].T_camera_world @ drift
         view = PlaceEvidence(look=20.0)
-        are_certain = sightings.add((Match(index, 0, pose, NONE, NONE, NONE), view))
-    assert are_certain is expected
+        proof = sightings.add((Match(index, 0, pose, NONE, NONE, NONE), view))
+    assert bool(proof) is expected
