@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
+import zstandard
 from numpy.typing import NDArray
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
@@ -168,6 +170,58 @@ def _bag(folder: Path, out: Path) -> None:
 def make_mcap(folder: Path) -> None:
     """Write a bag of one file."""
     _bag(folder, folder / 'drive.mcap')
+
+
+def make_compressed_mcap(folder: Path) -> None:
+    """Write a bag of one file that is compressed."""
+    make_mcap(folder)
+    file = folder / 'drive.mcap'
+    packed = zstandard.ZstdCompressor().compress(file.read_bytes())
+    file.with_suffix('.mcap.zstd').write_bytes(packed)
+    file.unlink()
+
+
+def make_pairs_list(folder: Path) -> None:
+    """Write a folder of the TUM RGB-D benchmark with a list of pairs alone."""
+    make_rgbd(folder)
+    root = folder / NAME
+    rows = (f'{1e-9 * t:.6f} rgb/{t}.png {1e-9 * t:.6f} depth/{t}.png\n' for t in STAMPS_NS)
+    _write(root / 'associations.txt', ''.join(rows))
+    for name in ('rgb', 'depth'):
+        (root / f'{name}.txt').unlink()
+
+
+def make_other_calibrations(folder: Path) -> None:
+    """Write one calibration as several tools do."""
+    eye = _eyes()[0]
+    fx, cx, cy = (float(eye.K[at]) for at in ((0, 0), (0, 2), (1, 2)))
+    cameras = [
+        [socket, {
+            'cameraType': 0, 'distortionCoeff': [0.01] + [0.0] * 13, 'width': WIDTH,
+            'height': HEIGHT, 'intrinsicMatrix': eye.K.tolist(), 'extrinsics': {
+                'rotationMatrix': np.eye(3).tolist(), 'toCameraSocket': 3 - socket,
+                'translation': {'x': -12.0, 'y': 0.0, 'z': 0.0},
+            },
+        }]
+        for socket in (1, 2)
+    ]  # fmt: skip
+    _write(folder / 'oak.json', json.dumps({'cameraData': cameras}))
+    lens = {'fx': fx, 'fy': fx, 'cx': cx, 'cy': cy, 'k1': 0.01, 'k2': 0.0, 'k3': 0.0, 'k4': 0.0}
+    pose = {'px': 0.0, 'py': 0.0, 'pz': 0.0, 'qx': 0.0, 'qy': 0.0, 'qz': 0.0, 'qw': 1.0}
+    value = {
+        'T_imu_cam': [pose, pose | {'px': 0.12}], 'resolution': [[WIDTH, HEIGHT]] * 2,
+        'intrinsics': [{'camera_type': 'kb4', 'intrinsics': lens}] * 2,
+    }  # fmt: skip
+    _write(folder / 'basalt.json', json.dumps({'value0': value}))
+    text = f'%YAML:1.0\nCamera.fx: {fx}\nCamera.fy: {fx}\nCamera.cx: {cx}\nCamera.cy: {cy}\n'
+    text += f'Camera.width: {WIDTH}\nCamera.height: {HEIGHT}\nCamera.bf: {0.12 * fx}\n'
+    _write(folder / 'orb.yaml', text)
+    sections = ''.join(
+        f'[{side}_CAM_VGA]\nfx={fx}\nfy={fx}\ncx={cx}\ncy={cy}\nk1=0\nk2=0\np1=0\np2=0\nk3=0\n'
+        for side in ('LEFT', 'RIGHT')
+    )
+    stereo = '[STEREO]\nBaseline=120\nTY=0\nTZ=0\nCV_VGA=0.001\nRX_VGA=0\nRZ_VGA=0\n'
+    _write(folder / 'zed.conf', sections + stereo)
 
 
 def make_bag_folder(folder: Path) -> None:
@@ -382,6 +436,17 @@ KINDS = {
     'EuRoC images': Kind(make_euroc, (f'{NAME}/cam?/data/*',), _mapped()),
     'RGB-D': Kind(make_rgbd, (f'{NAME}/*.txt', f'{NAME}/*.yaml', f'{NAME}/*/*'), _mapped()),
     'mcap': Kind(make_mcap, ('drive.mcap',), _mapped(input='drive.mcap')),
+    'compressed bag': Kind(
+        make_compressed_mcap, ('drive.mcap.zstd',), _mapped(input='drive.mcap.zstd')
+    ),
+    'list of pairs': Kind(make_pairs_list, (f'{NAME}/*.txt',), _mapped()),
+    **{
+        f'calibration {file}': Kind(
+            make_other_calibrations, (file,),
+            ('calibrate', '--from', f'{{}}/{file}', '--out', '{}/results'),
+        )
+        for file in ('oak.json', 'basalt.json', 'orb.yaml', 'zed.conf')
+    },
     'bag folder': Kind(make_bag_folder, (f'{NAME}/metadata.yaml', f'{NAME}/*.mcap'), _mapped()),
     'sqlite bag': Kind(make_sqlite, (f'{NAME}/*',), _mapped()),
     'ROS 1 bag': Kind(make_ros1, ('drive.bag',), _mapped(input='drive.bag')),

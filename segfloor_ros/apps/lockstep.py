@@ -61,6 +61,10 @@ ProgressListener = Callable[[int, str], None]
 """Called after every frame: how many are done, and the state in words."""
 
 
+LOW_M = 0.1
+"""Depth cameras, which see nothing nearer than 0.2 to 0.5 m, are mounted higher."""
+
+
 class Watcher(Protocol):
     """Watches a run, and changes nothing."""
 
@@ -335,6 +339,13 @@ class LockstepRun:
             raise InputError(f'{name}: {faults["no_rig"].line()}')
         lines = {name: fault.line() for name, fault in faults.items()}
         lines |= self._pipeline.keyframe_stages.floor.remarks
+        mount = self._known_mount
+        if mount is not None and self._source.takes_depth and mount.height_m < LOW_M:
+            lines.setdefault(
+                'depth_scale',
+                f'by its depths the camera is {mount.height_m:.2f} m above the floor; if it is '
+                'higher, set stereo_camera.depth_scale to the metres of one unit of depth',
+            )
         for name in sorted(lines.keys() - self._faults_said):
             self._faults_said.add(name)
             logger.warning('%s: %s', self._configuration.stereo_camera.input, lines[name])

@@ -11,14 +11,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from segfloor_ros.apps.recordings.extrinsics import calibration_from_extrinsics
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.errors import CalibrationError
 from segfloor_ros.core.files.whole import json_object, number, read_lines, read_text
 from segfloor_ros.core.geometry import Array, invert, make_transform
+from segfloor_ros.core.quaternions import transform_from_quaternion
 from segfloor_ros.nodes.yaml_files import read_yaml
 
 Size = tuple[int, int]
@@ -144,7 +145,7 @@ def _zed(file: _Reader) -> StereoCalibration:
         -1e-3 * float(file.numbers(f'STEREO.{key}', 1)[0]) if file.has(f'STEREO.{key}') else 0.0
         for key in ('Baseline', 'TY', 'TZ')
     ]
-    T = make_transform(Rotation.from_rotvec(turn).as_matrix(), np.array(place_m))
+    T = make_transform(cv2.Rodrigues(np.array(turn))[0], np.array(place_m))
     return file.raw_pair(size, intrinsics, T)
 
 
@@ -232,8 +233,11 @@ def _basalt(file: _Reader) -> StereoCalibration:
         K = _K(*(float(lens[key]) for key in ('fx', 'fy', 'cx', 'cy')))
         D = np.array([float(lens[key]) for key in terms[1]])
         intrinsics.append((K, D, terms[0]))
-        R = Rotation.from_quat([float(pose[f'q{axis}']) for axis in 'xyzw']).as_matrix()
-        T_imu.append(make_transform(R, np.array([float(pose[f'p{axis}']) for axis in 'xyz'])))
+        place_m, quat_xyzw = (
+            np.array([float(pose[f'{word}{axis}']) for axis in axes])
+            for word, axes in (('p', 'xyz'), ('q', 'xyzw'))
+        )
+        T_imu.append(transform_from_quaternion(place_m, quat_xyzw))
     if len(T_imu) != 2:
         raise file.error('holds one camera; a stereo pair has two')
     width, height = file.numbers('resolution', 2, values['resolution'][0]).astype(int).tolist()

@@ -74,8 +74,9 @@ no measurement."""
 WHITE_SHARE = 1 / 3
 """Lamps, windows and the sky whiten less."""
 
-NO_RIG_PX = 5.0
-"""Rows between both eyes change by less while a rig is driven, however badly it is rectified."""
+NO_RIG_PX, MOST_LAG_FRAMES = 5.0, 5.0
+"""Rows between both eyes change by less while a rig is driven, however badly it is rectified; a
+longer lag is no way to explain them, since points no longer move along a line meanwhile."""
 
 NEAREST_M, NEAREST_PERCENT = (0.25, 4.0), 95
 """The nearest twentieth of what a depth camera of a robot measures is farther than it reaches down
@@ -413,9 +414,12 @@ class RigCheck:
             return 0.0
         apart = []
         lag = self._lag_s(np.concatenate([look[np.isfinite(look).all(axis=1)] for look in enough]))
+        if abs(lag) > MOST_LAG_FRAMES * self._frame_s:
+            lag = 0.0
         for look in enough:
             rows_px = look[:, 3] - lag * np.nan_to_num(look[:, 5])
-            apart.append((float(np.median(rows_px)), spread_px(rows_px)))
+            middle_px = float(np.median(rows_px))
+            apart.append((middle_px, spread_px(rows_px - middle_px)))
         middles, spreads = np.array(apart).T
         change_px = float(np.ptp(middles))
         return change_px if change_px > SURE * float(np.median(spreads)) else 0.0

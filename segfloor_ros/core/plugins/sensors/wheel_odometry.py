@@ -163,7 +163,7 @@ class WheelCalibration:
             said['scale'] = (
                 f'wheel odometry measures {self.scale:.3f} m for each metre that the images show; '
                 'correct the radius of the wheels, or if it is right the baseline of the cameras '
-                f'or depth_scale, to {self.scale:.3f} of what it is'
+                f'(depth_scale of a depth camera), to {self.scale:.3f} of what it is'
             )
         if abs(self.turn_scale - 1) > max(0.03, 3 * turn_sigma):
             said['turn_scale'] = (
