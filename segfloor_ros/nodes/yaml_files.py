@@ -52,7 +52,7 @@ def read_marked_yaml(path: Path, error_type: type[SegfloorError] = InputError) -
     malformed.
     """
     # OpenCV and EuRoC files begin with `%YAML:1.0`, which is not a directive YAML knows.
-    # Their matrices have a tag of their own, and names of ORB-SLAM have no blank behind the colon.
+    # Their matrices have a tag of their own.
     text = re.sub('(?m)^%YAML:', '#', read_text(path, error_type, MAX_YAML_BYTES))
     text = text.replace('!!opencv-matrix', '')
     lines: dict[Key, int] = {}

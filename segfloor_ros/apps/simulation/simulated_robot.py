@@ -36,7 +36,7 @@ from segfloor_ros.nodes.settings.robot import SimulatedRobotNodeSettings
 from segfloor_ros.nodes.shared.inputs import LOOK_S
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
-from segfloor_ros.nodes.shared.transforms import TfLink
+from segfloor_ros.nodes.shared.tf_link import TfLink
 from segfloor_ros.nodes.stereo_camera import ClockPace
 
 WORLD, BASE = 'world', 'base_link'

@@ -18,6 +18,8 @@ def eye_calibration(info: Any, name: str, is_rectified: bool = False) -> EyeCali
     rectified P or else K counts; K and P are those of the whole image, of which `roi` and then
     `binning_x` and `binning_y` leave a part. name: of the topic, for messages. Raises
     CalibrationError or InputError.
+
+    A principal point may lie outside of an image that a roi says to be a part.
     """
     width, height = int(info.width), int(info.height)
     if width * height > MAX_PIXELS:
@@ -27,9 +29,10 @@ def eye_calibration(info: Any, name: str, is_rectified: bool = False) -> EyeCali
     K, R, P = K.reshape(3, 3), R if R.any() else np.eye(3), P.reshape(3, 4)
     P = P if P.any() else np.hstack([K, np.zeros((3, 1))])
     if is_rectified:
-        whole = EyeCalibration.of_rectified(width, height, P, name)
+        whole = EyeCalibration.of_rectified(width, height, P, name, bool(info.roi.width))
     else:
-        whole = EyeCalibration(width, height, K, D, R, P, info.distortion_model, name)
+        lens = D, R, P, info.distortion_model
+        whole = EyeCalibration(width, height, K, *lens, name, bool(info.roi.width))
     return _part_of(whole, info)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +19,9 @@ def camera_info_message(
     stamp_ns: int, frame_id: str, eye: EyeCalibration, make: Make = ros_message
 ) -> Message:
     """Return the calibration of one eye; both eyes carry the left optical frame (REP-104: the
-    right one's offset stands in P[3]).
+    right one's offset stands in P[3]). A part of an image has a roi as large as itself.
     """
+    part = {'height': eye.height, 'width': eye.width} if eye.is_part else {}
     arrays = {name: np.asarray(getattr(eye, name.upper()), np.float64).ravel() for name in 'dkrp'}
     return make(
         'sensor_msgs/msg/CameraInfo',
@@ -29,7 +32,7 @@ def camera_info_message(
         **arrays,
         binning_x=0,
         binning_y=0,
-        roi=make('sensor_msgs/msg/RegionOfInterest', **WHOLE_IMAGE),
+        roi=make('sensor_msgs/msg/RegionOfInterest', **WHOLE_IMAGE | part),
     )
 
 
@@ -44,10 +47,11 @@ def same_calibration(a: Message, b: Message) -> bool:
 def rectified_calibration(camera: StereoCamera) -> StereoCalibration:
     """Return the calibration of rectified images of a camera."""
     P = np.hstack([camera.K, np.zeros((3, 1))])
-    size = camera.width, camera.height
-    left = EyeCalibration.of_rectified(*size, P, is_part=True)
+    is_part = not (0 < camera.cx < camera.width and 0 < camera.cy < camera.height)
+    of_size = partial(EyeCalibration.of_rectified, camera.width, camera.height, is_part=is_part)
+    left = of_size(P)
     P[0, 3] = -camera.disparity_times_depth
-    return StereoCalibration(left, EyeCalibration.of_rectified(*size, P, is_part=True))
+    return StereoCalibration(left, of_size(P))
 
 
 def compressed_message(

@@ -398,3 +398,18 @@ def test_a_status_survives() -> None:
     (back,) = statuses(over_the_wire(status_message(status)))
     assert back == status
     assert (back.node, back.kind) == ('stereo_slam', 'connections')
+
+
+def test_a_part_of_an_image_survives_though_its_principal_point_lies_outside() -> None:
+    K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, -60.0], [0.0, 0.0, 1.0]])
+    part = EyeCalibration(
+        640, 200, K, np.zeros(5), np.eye(3), np.hstack([K, np.zeros((3, 1))]), is_part=True
+    )
+    message = over_the_wire(camera_info_message(STAMP_NS, 'eye', part))
+    for is_rectified in (False, True):
+        back = eye_calibration(message, 'info', is_rectified)
+        assert (back.width, back.height) == (640, 200)
+        np.testing.assert_array_equal(back.K, K)
+    camera = StereoCamera(640, 200, 500.0, 500.0, 320.0, -60.0, 0.1)
+    for eye in (rectified_calibration(camera).left, rectified_calibration(camera).right):
+        eye_calibration(over_the_wire(camera_info_message(STAMP_NS, 'eye', eye)), 'info', True)
