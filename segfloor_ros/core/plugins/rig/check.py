@@ -407,16 +407,18 @@ class RigCheck:
 
     def _change_px(self) -> float:
         """Return by how many rows the distance between both eyes changes from look to look, as far
-        as points of one look agree, without what one lag explains.
+        as points of one look agree, without what one lag explains: that needs their motion.
         """
         enough = [look for look in self._looks if len(look) >= MIN_MATCHES]
-        if len(enough) < RECENT - 1:
+        moved = [look[np.isfinite(look).all(axis=1)] for look in enough]
+        moved = [look for look in moved if len(look) >= MIN_MATCHES]
+        if len(moved) < RECENT - 1:
             return 0.0
         apart = []
-        lag = self._lag_s(np.concatenate([look[np.isfinite(look).all(axis=1)] for look in enough]))
+        lag = self._lag_s(np.concatenate(moved))
         if abs(lag) > MOST_LAG_FRAMES * self._frame_s:
             lag = 0.0
-        for look in enough:
+        for look in moved if lag else enough:
             rows_px = look[:, 3] - lag * np.nan_to_num(look[:, 5])
             middle_px = float(np.median(rows_px))
             apart.append((middle_px, spread_px(rows_px - middle_px)))
