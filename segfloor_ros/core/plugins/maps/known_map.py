@@ -139,6 +139,20 @@ class KnownMap:
         self._matches = self._matcher.sightings.add(seen)
         return bool(self._matches)
 
+    def recognise_all(self) -> bool:
+        """Whether keyframes of the own map see the known one: all that do, and agree with those
+        which proved it first, tie the two.
+        """
+        own = [keyframe for keyframe in self._own.keyframes if keyframe.retired is None]
+        proofs = [self._matches for k in own if self.recognise(k, k.observations.exact())]
+        self._matches = [
+            match
+            for proof in proofs
+            for match in proof
+            if self._matcher.agree(match, proofs[0][-1])
+        ]
+        return bool(proofs)
+
     def _travel(self, match: Match) -> float:
         """Return how likely the robot is at a match: at any place that it can have come to."""
         if self.of_drive and not self._matcher.is_within_reach(match):
@@ -214,8 +228,7 @@ def merge_slam(first: Arrays, second: Arrays, rig: Rig) -> Arrays | None:
     merged = SparseMap(rig)
     fill_map(merged, second)
     known = KnownMap(merged, first, of_drive=False)
-    alive = [keyframe for keyframe in merged.keyframes if keyframe.retired is None]
-    if not any(known.recognise(keyframe, keyframe.observations.exact()) for keyframe in alive):
+    if not known.recognise_all():
         return None
     words = known.merge({name: second[name] for name in ('words', 'word_count')})
     places = PlaceRecognition(merged)
