@@ -28,6 +28,7 @@ from segfloor_ros.core.contracts import (
     UNKNOWN_COVARIANCE,
     FloorObservation,
     FrameResult,
+    InputFault,
     Keyframe,
     KeyframePath,
     Mount,
@@ -215,7 +216,8 @@ class LockstepRun:
         self._unmasked: dict[int, StereoFrame] = {}
         self._results: list[FrameResult] = []
         self._failed_frames = 0
-        self._faults_said: set[str] = set()
+        self._said: dict[str, str] = {}
+        self._faults_said: dict[str, InputFault] = {}
         self._loop_times_s: list[float] = []
         self._frames = 0
         self._path = KeyframePath(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
@@ -346,8 +348,9 @@ class LockstepRun:
                 f'by its depths the camera is {mount.height_m:.2f} m above the floor; if it is '
                 'higher, set stereo_camera.depth_scale to the metres of one unit of depth',
             )
-        for name in sorted(lines.keys() - self._faults_said):
-            self._faults_said.add(name)
+        self._faults_said = faults | self._faults_said
+        for name in sorted(lines.keys() - self._said.keys()):
+            self._said[name] = lines[name]
             logger.warning('%s: %s', self._configuration.stereo_camera.input, lines[name])
 
     def _attempt(self, index: int, step: Callable[[], T]) -> T | None:
@@ -422,7 +425,11 @@ class LockstepRun:
         }
 
     def _summary(self, wall_s: float, has_map: bool) -> results_folder.RunSummary:
-        slam, pipeline = self._pipeline.slam, self._pipeline
+        slam, pipeline, stages = self._pipeline.slam, self._pipeline, self._pipeline.keyframe_stages
+        # Figures that have changed since they were printed stay as printed.
+        of_floor = [self._said.get(about, words) for about, words in stages.floor.remarks.items()]
+        faults = slam.rig_check.faults
+        faults.update({name: self._faults_said.get(name, one) for name, one in faults.items()})
         return results_folder.summarise(
             [results_folder.DriveFrame.of(result) for result in self._results],
             wall_s,
@@ -431,9 +438,9 @@ class LockstepRun:
             skipped_frames=self._source.skipped_frames,
             keyframes=len(slam.map.keyframes),
             loop_times_s=self._loop_times_s,
-            map_updates=pipeline.keyframe_stages.map_updates,
+            map_updates=stages.map_updates,
             sensors=self._sensors_used(),
-            sensor_remarks=[*slam.sensors.remarks.values(), *pipeline.keyframe_stages.remarks],
+            sensor_remarks=[*slam.sensors.remarks.values(), *stages.semantics.remarks, *of_floor],
             input_faults=slam.rig_check.as_dicts(),
             failed_frames=self._failed_frames,
             failed_keyframes=pipeline.failed_keyframes,

@@ -320,6 +320,19 @@ def test_without_a_floor_everything_but_the_map_is_written(tmp_path):
     assert done.returncode == 0 and 'segfloor' not in done.stderr
 
 
+def test_the_figure_of_a_fault_is_the_same_wherever_it_stands(tmp_path, caplog):
+    """Rows that are two apart at first, and four later, after that was printed."""
+    frames, _ = room_drive(160, step_m=0.02)
+    off = [replace(f, right=np.roll(f.right, 2 if f.index < 60 else 4, axis=0)) for f in frames]
+    drive, out = write_kitti(tmp_path / 'drive', off), tmp_path / 'out'
+    done = segfloor('run', drive, '--out', out, '--no-map', '--report')
+    assert done.returncode == 0, done.stderr
+    (printed,) = re.findall(r'stand ([0-9.]+) rows apart', caplog.text)
+    (fault,) = json.loads((out / 'summary.json').read_text())['input_faults']
+    assert f'{fault["value"]:.1f}' == printed == '2.0'
+    assert f'rows apart ({fault["value"]:g} px)' in (out / 'report.html').read_text()
+
+
 def test_the_path_alone_takes_a_mount_that_is_given(recording, result, tmp_path):
     out = tmp_path / 'out'
     done = segfloor('run', recording, '--out', out, '--no-map', *with_mount())
