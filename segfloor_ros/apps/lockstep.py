@@ -169,6 +169,10 @@ class MapOptions:
 NO_MAPS = MapOptions()
 
 
+MOST_AT_BEGIN = 3 * SETTLED_FRAMES
+"""Two cameras that are no rig show it by then; later it is a fault like others."""
+
+
 class LockstepRun:
     """One run of a source through the pipeline, with everything noted that the results folder
     needs. interrupted: ends the drive after the frame at which it is set. path_only: no map is
@@ -336,13 +340,15 @@ class LockstepRun:
 
     def _say_faults(self) -> None:
         faults = self._pipeline.slam.rig_check.faults
-        if 'no_rig' in faults:
+        is_early = self._frames <= MOST_AT_BEGIN
+        if 'no_rig' in faults and is_early:
             name = self._configuration.stereo_camera.input
             raise InputError(f'{name}: {faults["no_rig"].line()}')
         lines = {name: fault.line() for name, fault in faults.items()}
         lines |= self._pipeline.keyframe_stages.floor.remarks
         mount = self._known_mount
-        if mount is not None and self._source.takes_depth and mount.height_m < LOW_M:
+        is_given = self._configuration.stereo_slam.has_mount or not self._source.takes_depth
+        if mount is not None and mount.height_m < LOW_M and not is_given:
             lines.setdefault(
                 'depth_scale',
                 f'by its depths the camera is {mount.height_m:.2f} m above the floor; if it is '

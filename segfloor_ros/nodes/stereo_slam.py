@@ -68,6 +68,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             camera = saved_camera(saved, name)
             self.slam = self._make_slam(camera)
             self._maps.loaded = saved, load_slam(self.slam, camera, saved, name, own.localize)
+            self._keep_axes(saved)
 
     def reset(self, reason: str) -> None:
         """Drop the map, which is saved first where `save_map` names a file."""
@@ -86,8 +87,16 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         camera = saved_camera(saved, 'kept map')
         self.slam = self._make_slam(camera)
         load_slam(self.slam, camera, saved, 'kept map', last=last)
+        self._keep_axes(saved)
         self._stamps = StampOrder(last.stamp_ns)
         self._is_resumed = True
+
+    def _keep_axes(self, saved: MapFile) -> None:
+        """Let poses alone have the axes that they had in a saved map."""
+        if self.slam is not None and self.settings.path_only:
+            from segfloor_ros.core.plugins.maps.saved_slam import base_of
+
+            self.slam.rig.base = base_of(saved)
 
     def is_needed_otherwise(self) -> bool:
         """Whether anybody listens to tf."""
@@ -227,7 +236,8 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             mount = None if own.gives_mount else self._transforms.mount(frames.left)
             if own.path_only and mount is None and not own.has_mount:
                 mount = CAMERA_AS_BASE
-            with about(f'tf from {own.base_frame} to {frames.left}'):
+            source = f'tf from {own.base_frame} to {frames.left}' if mount else 'camera_height_m'
+            with about(source):
                 self.slam = self._make_slam(camera, mount)
         self.slam.announce = self._results.announce if self.settings.background else None
         self._results.topics.begin(self._camera.calibration, frames)
@@ -239,7 +249,8 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         """Build SLAM with all that plugs in, which is loaded only now."""
         from segfloor_ros.core.plugins.assembly import make_slam
 
-        return make_slam(camera, self.settings, mount, background=self.settings.background)
+        own = self.settings
+        return make_slam(camera, own, mount, background=own.background, path_only=own.path_only)
 
     def _end_stage(self) -> None:
         if self.slam is not None:

@@ -310,8 +310,9 @@ def _both_in(folder: Path) -> list[Path]:
     """Return the files of a folder that hold the calibration of both cameras."""
     found = []
     for path in sorted(folder.iterdir() if folder.is_dir() else ()):
-        with suppress(CalibrationError):  # of another kind
-            if path.suffix.lower() in SUFFIXES and path.stat().st_size < MOST_BYTES:
+        with suppress(CalibrationError, OSError):  # of another kind
+            is_one = path.suffix.lower() in SUFFIXES and path.is_file()
+            if is_one and path.stat().st_size < MOST_BYTES:
                 found += [path] if holds_both(path) else []
     return found
 

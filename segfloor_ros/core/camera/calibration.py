@@ -32,7 +32,10 @@ MODEL_ALIASES = {
 SAME_PX = 1e-3
 """Intrinsics that differ by less than this are the same."""
 
-PINHOLE_ZEROS = {(0, 1): SAME_PX, (1, 0): SAME_PX, (2, 0): 1e-6, (2, 1): 1e-6, (2, 2): 1e-6}
+MOST_SKEW_PX = 1.0
+"""Calibrations that estimate a skew find as much where there is none."""
+
+PINHOLE_ZEROS = {(0, 1): MOST_SKEW_PX, (1, 0): SAME_PX, (2, 0): 1e-6, (2, 1): 1e-6, (2, 2): 1e-6}
 """How far the other elements of K and P may be from those of the identity, by row and column."""
 
 SAME_ROWS = 0.1

@@ -32,8 +32,12 @@ CHANNELS = {
 """Channels by encoding, as in `sensor_msgs/image_encodings.hpp` and cv_bridge's generic names."""
 
 
-CLEARLY = 2.0
-"""Colours have so much less contrast than the brightness."""
+CLEARLY, LEAST_CONTRAST, SMOOTH_SHARE = 2.0, 10.0, 0.25
+"""Brightness has so many times the contrast of colours, in grey levels more than noise has; from
+pixel to pixel it changes by less than this share of that."""
+
+NO_COLOUR, COLOUR_REACH = 128.0, 24.0
+"""What U and V are without a colour, and how far their mean over an image is from that."""
 
 DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 
@@ -199,12 +203,19 @@ def _grey_of(pixels: Grey, encoding: str) -> Grey:
 
 
 def _luma_of(pixels: Grey, encoding: str) -> int:
-    """Return which of both channels (H, W, 2) is the brightness: that of the encoding unless it has
-    far less contrast than the other, as drivers mix UYVY and YUYV up. The colours U and V take
-    turns along a row.
+    """Return which of both channels (H, W, 2) is the brightness: that of the encoding unless it
+    looks like colours and the other one does not, as drivers mix UYVY and YUYV up. The colours U
+    and V take turns along a row, around 128; brightness hardly changes from pixel to pixel.
     """
     declared = int(encoding in ('yuv422', 'uyvy'))
     rows = pixels[::8].astype(np.float32)
-    contrast = (rows[:, ::2].std(axis=(0, 1)) + rows[:, 1::2].std(axis=(0, 1))).tolist()
-    is_mixed_up = contrast[1 - declared] > CLEARLY * contrast[declared]
-    return 1 - declared if is_mixed_up else declared
+    even, odd = rows[:, : rows.shape[1] // 2 * 2 : 2], rows[:, 1::2]
+    contrast = even.std(axis=(0, 1)) + odd.std(axis=(0, 1))
+    other = 1 - declared
+    steps = float(np.abs(even[:, :, other] - odd[:, :, other]).mean())
+    is_mixed_up = (
+        abs(float(rows[:, :, declared].mean()) - NO_COLOUR) < COLOUR_REACH
+        and contrast[other] > max(CLEARLY * contrast[declared], LEAST_CONTRAST)
+        and steps < SMOOTH_SHARE * contrast[other]
+    )
+    return other if is_mixed_up else declared

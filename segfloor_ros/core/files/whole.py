@@ -103,9 +103,13 @@ def nanoseconds(time: str, digits: int = 0) -> int:
     return checked_ns(int(value.scaleb(9 - digits).to_integral_value()), time)
 
 
-_UNITS = ((3, 'ms', 20, 1e11), (6, 'µs', 3e3, 1e14), (9, 'ns', 3e6, 1e17))
-"""Units of time: their digits below one second, name, the step from row to row and the time from
-which on a time is one in this unit: 20 s to 3,000 ms are no step of a robot, 1e11 s is no date."""
+_UNITS = ((3, 'ms', 5, 1e11), (6, 'µs', 3e3, 1e14), (9, 'ns', 3e5, 1e17))
+"""Units of time: their digits below one second, name, the step from row to row from which on times
+that count from a start are in this unit, and the time from which on it is one whatever the step:
+5 s to 3,000 ms are no step of a robot, 1e11 s is no date."""
+
+_DATES_S, _LONGEST_S = (9e8, 4e9), 1e4
+"""Seconds since 1970 from 1998 to 2096, and from row to row."""
 
 
 def digits_of(times: Iterable[str], where: str) -> int:
@@ -122,7 +126,13 @@ def digits_of(times: Iterable[str], where: str) -> int:
     is_whole = all('.' not in word or 'e' in word.lower() for word in words)
     step = float(np.median(steps)) if len(steps) and is_whole else 0.0
     latest = float(values.max(initial=0.0))
-    fitting = [unit for unit in _UNITS if step >= unit[2] or latest >= unit[3]]
+    fitting = [unit for unit in _UNITS if latest >= unit[3]]
+    first_s, last_s = _DATES_S
+    are_dates = (
+        len(values) > 0 and values.min() >= first_s and latest < last_s and step < _LONGEST_S
+    )
+    if not fitting and not are_dates:
+        fitting = [unit for unit in _UNITS if step >= unit[2]]
     if not fitting:
         return 0
     digits, name, *_ = fitting[-1]
@@ -130,7 +140,7 @@ def digits_of(times: Iterable[str], where: str) -> int:
     return digits
 
 
-_DATE = re.compile(r'(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(\.\d+)?')
+_DATE = re.compile(r'(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(?:[.,](\d+))?')
 
 
 def time_of(line: str) -> str:
@@ -139,12 +149,12 @@ def time_of(line: str) -> str:
     """
     found = _DATE.match(line.strip())
     if found is None:
-        return line.replace(',', ' ').split()[0]
+        return next(iter(line.replace(',', ' ').split()), line)
     try:
         then = datetime.fromisoformat(f'{found[1]}T{found[2]}+00:00')
     except ValueError:
         return found[0]
-    return f'{int(then.timestamp())}{found[3] or ""}'
+    return f'{int(then.timestamp())}' + (f'.{found[3]}' if found[3] else '')
 
 
 def whole_nanoseconds(word: str) -> int:

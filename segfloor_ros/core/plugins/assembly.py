@@ -31,15 +31,17 @@ def make_slam(
     mount: Mount | None = None,
     times: StageTimes | None = None,
     background: bool = False,
+    path_only: bool = False,
 ) -> StereoSlam:
     """Build stereo SLAM with the camera's mount: `mount` when it is known (from tf), else from
     the settings, and whatever the settings leave open is measured from the floor the camera
     sees. CAMERA_AS_BASE: it is measured, too, and tracking is the same, but results wait for none
-    and have the axes of the camera. background: adjust the map beside tracking. Raises InputError
-    for an impossible mount.
+    and have the axes of the camera. background: adjust the map beside tracking. path_only: the
+    same for any other mount of a camera that cannot see a floor; else it raises InputError.
     """
-    base = mount if mount is CAMERA_AS_BASE else None
-    mount = None if mount is base else mount
+    is_frame = path_only and mount is not None and not is_mount(mount)
+    base = mount if mount is CAMERA_AS_BASE or is_frame else None
+    mount = None if base is not None else mount
     height_m, pitch_rad, roll_rad = (
         settings.camera_height_m,
         settings.camera_pitch_rad,
@@ -67,8 +69,18 @@ def make_slam(
     return slam
 
 
+STRAIGHT_DOWN_RAD = math.radians(75)
 LEAST_HEIGHT_M, MOST_UP_RAD, MOST_ROLL_RAD = 0.02, math.radians(30), math.radians(60)
 """A camera that maps a floor is above it, and sees it upright."""
+
+
+def is_mount(mount: Mount) -> bool:
+    """Whether a camera can be mounted so."""
+    try:
+        check_mount(mount)
+    except InputError:
+        return False
+    return True
 
 
 def check_mount(mount: Mount) -> None:
@@ -80,7 +92,9 @@ def check_mount(mount: Mount) -> None:
             'the frame of the base is the camera itself; set base_frame to the frame of the robot '
             'on the floor, e.g. base_link'
         )
-    if -mount.pitch_rad > MOST_UP_RAD or abs(mount.roll_rad) > MOST_ROLL_RAD:
+    # Of a camera that looks straight down, roll and heading are one.
+    is_rolled = mount.pitch_rad < STRAIGHT_DOWN_RAD and abs(mount.roll_rad) > MOST_ROLL_RAD
+    if -mount.pitch_rad > MOST_UP_RAD or is_rolled:
         raise InputError(
             f'the camera would look down by {pitch:.0f} deg and be rolled by {roll:.0f} deg: its '
             'frame is no optical one (x right, y down, z ahead; REP-103); let its driver stamp the '
@@ -138,6 +152,6 @@ def make_pipeline(
     """
     times = times or StageTimes()
     mount = CAMERA_AS_BASE if path_only and not configuration.stereo_slam.has_mount else None
-    slam = make_slam(camera, configuration.stereo_slam, mount, times)
+    slam = make_slam(camera, configuration.stereo_slam, mount, times, path_only=path_only)
     stages = partial(make_stages, camera, configuration, times, labeller)
     return Pipeline(slam, stages, times, on_keyframe, path_only)

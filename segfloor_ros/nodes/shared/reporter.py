@@ -154,7 +154,9 @@ class Reporter:
         which only the latest counts are nothing.
         """
         is_passing = all(TOPICS[name].profile is FRAMES for name in joiner.parts)
-        for dropped in joiner.take_dropped() if not is_passing else ():
+        for dropped in joiner.take_dropped():
+            if is_passing:
+                continue
             names = ', '.join(dropped.missing)
             crowded = ''.join(
                 f'; {name} is published by {count} nodes, stop or remap one'

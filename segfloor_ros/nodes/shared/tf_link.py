@@ -33,7 +33,7 @@ class TfLink:
     ) -> None:
         self.frames = FrameTree()
         self._on_heard = on_heard
-        self._sent: deque[TransformStamped] = deque(maxlen=KEYFRAMES.depth)
+        self._sent: deque[TransformStamped] = deque(maxlen=2 * KEYFRAMES.depth)
         self.is_there = importlib.util.find_spec('tf2_msgs') is not None
         self._node = node
         self._outputs: dict[str, Any] = {}
@@ -87,7 +87,8 @@ class TfLink:
     def _take(self, is_fixed: bool, message: Any) -> None:
         for found in message.transforms:
             parent, child = found.header.frame_id, found.child_frame_id
-            if self._on_heard is not None and found not in self._sent:
+            own = [one for one in self._sent if one.child_frame_id == child]
+            if self._on_heard is not None and found not in own:
                 self._on_heard(found)
             try:
                 if is_fixed:

@@ -40,7 +40,7 @@ class Transforms:
         self._link = TfLink(node, on_heard)
         self._publishers = 0
         self._tf = self._link.frames
-        self._opened_s = self._deadline_s = 0.0
+        self._opened_s = self._deadline_s = self._listens_until_s = 0.0
         self._mounted: tuple[str, Array] | None = None
         self._unsent_mount: tuple[int, str, Mount] | None = None
         self._is_announced = False
@@ -132,7 +132,7 @@ class Transforms:
         publishers = self._node.count_publishers('/tf') + self._node.count_publishers('/tf_static')
         if publishers > self._publishers and self._own.publish_tf:  # which may be rivals
             self._link.listen()
-            self._deadline_s = max(self._deadline_s, time.monotonic() + PATIENCE_S)
+            self._listens_until_s = time.monotonic() + PATIENCE_S
         self._publishers = publishers
         if self._unsent_mount is not None and time.monotonic() >= self._deadline_s:
             if self._own.publish_tf:
@@ -140,7 +140,8 @@ class Transforms:
             self._unsent_mount = None
         # A fused odometry is listened to on and on.
         has_mount = self._is_announced and self._unsent_mount is None
-        if has_mount and not self._is_fused and time.monotonic() >= self._deadline_s:
+        is_heard = time.monotonic() >= max(self._deadline_s, self._listens_until_s)
+        if has_mount and not self._is_fused and is_heard:
             self._link.stop_listening()
         if self._is_fused:
             self._correct()

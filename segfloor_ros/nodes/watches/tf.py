@@ -27,6 +27,9 @@ class RivalWatch:
         me, others = self._node.get_name(), set()
         for topic in ('/tf', '/tf_static'):
             others |= {i.node_name for i in self._node.get_publishers_info_by_topic(topic)}
+        others -= {me}
+        if not others:
+            return
         remedy = f'set publish_odom_tf of {me} to false where the other is to own it'
         if child == own.odom_frame:
             remedy = f'let one of both localise, or set publish_tf of {me} to false'
@@ -34,7 +37,7 @@ class RivalWatch:
             remedy = f'set base_frame of {me} to {parent}'
         self._node.reporter.diagnose(
             f'{child} on tf',
-            f'{child} jumps: tf has it below {parent}, by {" or ".join(sorted(others - {me}))}, '
+            f'{child} jumps: tf has it below {parent}, by {" or ".join(sorted(others))}, '
             f'and below {ours[child]}, by {me}; {remedy}, or stop the other',
             Level.ERROR,
             PATIENCE_S,

@@ -27,6 +27,7 @@ from segfloor_ros.apps.recordings.calibration_files import write_ros_calibration
 from segfloor_ros.core.camera.depth import VIRTUAL_BASELINE_M
 from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.errors import CalibrationError, InputError
+from segfloor_ros.core.files.whole import digits_of, time_of
 from segfloor_ros.core.plugins.rig.check import RigCheck
 
 PAIRS = grey_pairs(4)
@@ -50,6 +51,26 @@ def test_times_of_wheels_in_ns_are_recognised(tmp_path: Path) -> None:
     (folder / 'wheel_odometry.txt').write_text(''.join(rows))
     (wheels,) = opened(folder).sensors
     assert [m.stamp_ns for m in wheels.read()] == [i * 100 * MS for i in range(4)]
+
+
+@pytest.mark.parametrize(
+    ('words', 'digits'),
+    [
+        ('0 16 33 50 66', 3),  # 60 Hz
+        ('0 2000000 4000000 6000000', 9),  # 500 Hz
+        ('1700000000000 1700000004000 1700000008000', 3),  # a step that µs would fit, too
+        ('1700000000000000 1700000004000000 1700000008000000', 6),
+        ('1700000000 1700000030 1700000060', 0),
+        ('0.0 30.5 61.0', 0),
+    ],
+)
+def test_a_date_tells_the_unit_before_a_step_does(words, digits) -> None:
+    assert digits_of(words.split(), 'times.txt') == digits
+
+
+def test_odd_rows_have_a_time_or_are_named_by_it() -> None:
+    assert time_of(',,,') == ',,,'
+    assert time_of('2011-09-26 13:02:25,964 1 2') == time_of('2011-09-26 13:02:25.964')
 
 
 def test_whole_seconds_stay_seconds(tmp_path: Path, caplog) -> None:
@@ -190,7 +211,15 @@ def test_depth_has_the_unit_that_is_given(tmp_path: Path, kind: str, scale: floa
 
 @pytest.mark.parametrize(
     ('depth_m', 'is_right'),
-    [(2.0, True), (0.6, True), (2.0 / 5, True), (0.8 / 5, False), (1.5 * 5, False), (2e3, False)],
+    [
+        (2.0, True),
+        (0.6, True),
+        (0.8 / 5, True),
+        (0.3 / 5, False),
+        (1.5 * 5, True),
+        (3.0 * 5, False),
+        (2e3, False),
+    ],
 )
 def test_a_unit_that_cannot_be_is_said(depth_m: float, is_right: bool) -> None:
     source_camera = calibration().camera

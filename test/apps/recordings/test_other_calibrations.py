@@ -249,6 +249,7 @@ def test_a_file_of_another_tool_beside_the_images_is_found(tmp_path: Path, name:
     folder = write_folders(tmp_path, grey_pairs(2, *SIZE))
     for side in ('left', 'right'):
         (folder / f'{side}.yaml').unlink()
+    (folder / 'notes.yaml').symlink_to(tmp_path / 'gone')
     write, kind = FILES[name]
     file = write(folder)
     same(opened(folder).calibration, truth(kind))

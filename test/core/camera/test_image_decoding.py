@@ -91,6 +91,29 @@ def test_yuv_gives_its_luminance(encoding: str, data: list[int]) -> None:
     assert raw(bytes(data), 2, 2, encoding).tolist() == [[10, 20], [30, 40]]
 
 
+SCENES = {
+    'dark': (18, 18, (130, 126), (126, 130)),
+    'overexposed': (255, 255, (128, 128), (129, 127)),
+    'red beside blue': (82, 60, (90, 240), (240, 110)),
+    'terracotta before grey': (110, 125, (105, 155), (128, 128)),
+}
+"""Brightness of the left and the right half of an image, and (U, V) of each."""
+
+
+@pytest.mark.parametrize('encoding', ['yuyv', 'uyvy'])
+@pytest.mark.parametrize('scene', SCENES)
+def test_images_of_little_contrast_keep_their_brightness(encoding: str, scene: str) -> None:
+    left, right, *colours = SCENES[scene]
+    rng = np.random.default_rng(3)
+    y = np.repeat([left, right], 32)[None].repeat(48, 0) + rng.integers(0, 2, (48, 64))
+    uv = np.repeat(np.array(colours)[:, None], 16, 1).reshape(1, 64).repeat(48, 0)
+    uv = uv + rng.integers(-1, 2, uv.shape)
+    channels = (y, uv) if encoding == 'yuyv' else (uv, y)
+    data = np.clip(np.stack(channels, axis=2), 0, 255).astype(np.uint8)
+    grey = raw(data.tobytes(), 64, 48, encoding)
+    np.testing.assert_array_equal(grey, np.clip(y, 0, 255))
+
+
 @pytest.mark.parametrize('bits', [8, 16])
 @pytest.mark.parametrize('pattern', ['rggb', 'bggr', 'gbrg', 'grbg'])
 def test_bayer_mosaic_of_one_colour_is_one_grey(pattern: str, bits: int) -> None:

@@ -13,14 +13,15 @@ from segfloor_ros.core.contracts import UNKNOWN_COVARIANCE
 from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.files.results import from_bytes, to_bytes
 from segfloor_ros.core.geometry import invert
-from segfloor_ros.core.plugins.assembly import equipped_slam
+from segfloor_ros.core.plugins.assembly import equipped_slam, make_slam
 from segfloor_ros.core.plugins.maps.known_map import KnownMap, as_seen_by
 from segfloor_ros.core.plugins.maps.map_arrays import fill_map, moved
-from segfloor_ros.core.plugins.maps.saved_slam import load_slam, save_slam
+from segfloor_ros.core.plugins.maps.saved_slam import base_of, load_slam, mount_of, save_slam
 from segfloor_ros.core.slam.rig import OffsetEstimate, Rig
 from segfloor_ros.core.slam.session import SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import SparseMap
+from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE
 from segfloor_ros.core.slam.tracking.frame_to_frame import FrameToFrame
 from segfloor_ros.core.slam.tracking.map_tracking import Tracker
 from segfloor_ros.core.twists import se3_exp
@@ -77,6 +78,17 @@ def test_a_loaded_map_is_the_one_that_was_saved(mapped):
     stamps = [k.stamp_ns for k in slam.map.keyframes]
     assert stamps[-1] < 0
     assert np.diff(stamps).tolist() == np.diff([k.stamp_ns for k in mapped.map.keyframes]).tolist()
+
+
+def test_a_map_of_poses_alone_keeps_the_mount_that_was_measured_and_their_axes():
+    room = StereoRoom(seed=5)
+    slam = make_slam(CAMERA, SETTINGS, CAMERA_AS_BASE)
+    for i in range(12):
+        slam.process(room.frame(i, planar_pose(0.06 * i, 0.0, 0.0)))
+    assert slam.rig.mount is not None
+    saved = from_bytes(to_bytes(save_slam(slam, CAMERA)), 'x')
+    assert mount_of(saved) == slam.rig.mount
+    assert base_of(saved) == CAMERA_AS_BASE
 
 
 def test_the_disparity_offset_is_that_of_the_rig_that_made_the_map(mapped):

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.core.contracts import NO_POINT, StereoFrame
+from segfloor_ros.core.contracts import NO_POINT, Mount, StereoFrame
+from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import invert, rotation_angle
 from segfloor_ros.core.plugins.assembly import equipped_slam, make_slam
 from segfloor_ros.core.slam.settings import StereoSlamSettings
@@ -357,6 +358,22 @@ def test_a_path_alone_waits_for_no_mount_and_measures_it_all_the_same(frames):
         T = CAMERA_AS_BASE.T_base_left
         at_left = invert(T) @ other.T_map_odom @ other.T_odom_base @ T
         np.testing.assert_allclose(at_left, T_first_left, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    'mount', [Mount(0.0), Mount(-0.03, forward_m=0.1), Mount(0.5, roll_rad=1.5)]
+)
+def test_a_frame_that_is_no_mount_will_do_for_a_path_alone(mount):
+    """A body of a camera that is carried by hand, a drone, a camera on its side."""
+    with pytest.raises(InputError, match='the camera would '):
+        make_slam(CAMERA, SETTINGS, mount)
+    slam = make_slam(CAMERA, SETTINGS, mount, path_only=True)
+    assert slam.mount == mount and slam.rig.mount is None
+
+
+def test_a_camera_that_looks_straight_down_is_mounted_well():
+    slam = make_slam(CAMERA, SETTINGS, Mount(0.5, np.radians(88.0), np.pi))
+    assert slam.mount is not None
 
 
 def test_waiting_for_the_mount_does_not_fill_the_memory(frames, monkeypatch):

@@ -55,7 +55,13 @@ def save_slam(slam: StereoSlam, camera: StereoCamera) -> MapFile:
         own = {'first_ns': own_ns[0], 'last_ns': own_ns[-1], 'keyframes': len(own_ns)}
         # A drive that goes on after it was broken off is in the list already.
         sessions = [s for s in sessions if s['first_ns'] != own_ns[0]] + [own]
-    header = {'camera': asdict(camera), 'mount': asdict(slam.mount), 'sessions': sessions}
+    rig = slam.rig
+    header = {
+        'camera': asdict(camera),
+        'mount': asdict(rig.mount or slam.mount),
+        'sessions': sessions,
+        **({'base': asdict(rig.base)} if rig.base else {}),
+    }
     return MapFile(header, {PART: arrays})
 
 
@@ -171,9 +177,14 @@ def sessions_of(saved: MapFile) -> list[dict[str, int]]:
     return [{name: int(s[name]) for name in names} for s in saved.header.get('sessions', [])]
 
 
-def mount_of(saved: MapFile) -> Mount:
+def base_of(saved: MapFile) -> Mount | None:
+    """Return where poses alone had the base, None for at the mount. Raises as `mount_of`."""
+    return mount_of(saved, 'base') if 'base' in saved.header else None
+
+
+def mount_of(saved: MapFile, name: str = 'mount') -> Mount:
     """Return the mount that a map was made with. Raises KeyError, TypeError or ValueError."""
-    values = saved.header['mount']
+    values = saved.header[name]
     if not all(type(value) in (int, float) and math.isfinite(value) for value in values.values()):
         raise ValueError('a mount of no numbers')
     return Mount(**values)

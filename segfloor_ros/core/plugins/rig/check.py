@@ -78,7 +78,7 @@ NO_RIG_PX, MOST_LAG_FRAMES = 5.0, 5.0
 """Rows between both eyes change by less while a rig is driven, however badly it is rectified; a
 longer lag is no way to explain them, since points no longer move along a line meanwhile."""
 
-NEAREST_M, NEAREST_PERCENT = (0.25, 4.0), 95
+NEAREST_M, NEAREST_PERCENT = (0.08, 12.0), 95
 """The nearest twentieth of what a depth camera of a robot measures is farther than it reaches down
 to, and no farther than the floor or the walls around it; other figures have another unit."""
 
@@ -344,8 +344,7 @@ class RigCheck:
         return guess._replace(right_px=np.asarray(right_px, np.float32)).those(found)
 
     def _judge(self) -> None:
-        if 'no_rig' in self.faults:
-            return
+        self.faults.pop('no_rig', None)
         seen = np.concatenate(self._looks)
         points = sum(self._points)
         if len(seen) < max(MIN_MATCHES, FOUND_SHARE * points):
@@ -409,8 +408,7 @@ class RigCheck:
         """Return by how many rows the distance between both eyes changes from look to look, as far
         as points of one look agree, without what one lag explains: that needs their motion.
         """
-        enough = [look for look in self._looks if len(look) >= MIN_MATCHES]
-        moved = [look[np.isfinite(look).all(axis=1)] for look in enough]
+        moved = [look[np.isfinite(look).all(axis=1)] for look in self._looks]
         moved = [look for look in moved if len(look) >= MIN_MATCHES]
         if len(moved) < RECENT - 1:
             return 0.0
@@ -418,13 +416,18 @@ class RigCheck:
         lag = self._lag_s(np.concatenate(moved))
         if abs(lag) > MOST_LAG_FRAMES * self._frame_s:
             lag = 0.0
-        for look in moved if lag else enough:
-            rows_px = look[:, 3] - lag * np.nan_to_num(look[:, 5])
+        for look in moved:
+            speed_px = look[:, 5]
+            rows_px = look[:, 3] - lag * speed_px
             middle_px = float(np.median(rows_px))
-            apart.append((middle_px, spread_px(rows_px - middle_px)))
-        middles, spreads = np.array(apart).T
+            small_px = 0.0 if lag else LAG_FRAMES * self._frame_s * abs(float(np.median(speed_px)))
+            apart.append((middle_px, spread_px(rows_px - middle_px), small_px))
+        middles, spreads, small = np.array(apart).T
+        # One look may be of images that do not belong together.
+        off = np.sort(np.maximum(np.abs(middles - np.median(middles)) - small, 0.0))[:-1]
         change_px = float(np.ptp(middles))
-        return change_px if change_px > SURE * float(np.median(spreads)) else 0.0
+        is_sure = 2 * off[-1] > max(NO_RIG_PX, SURE * float(np.median(spreads)))
+        return change_px if is_sure else 0.0
 
     def _judge_pictures(self) -> None:
         if len(self._pictures) < RECENT:
