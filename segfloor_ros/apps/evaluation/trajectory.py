@@ -166,7 +166,11 @@ def axes_between(truth: Array, estimate: Array) -> Array | None:
         for one in (estimated, estimated @ R.T)
     )
     is_clear = turned < min(as_they_are / 2, step_m * OTHER_AXES)
-    return R if is_clear and Rotation.from_matrix(R).magnitude() > OTHER_AXES else None
+    # Ahead is x in those of a base, and across x, which is to the right, in optical ones.
+    ahead = (np.abs(one[: len(first)].mean(axis=0)) for one in (true, estimated))
+    least, most = sorted(float(one[0] / max(np.linalg.norm(one), 1e-9)) for one in ahead)
+    are_optical = least < np.sin(OTHER_AXES) and most > np.cos(OTHER_AXES)
+    return R if is_clear and are_optical else None
 
 
 def _steps_m(poses: Array) -> Array:

@@ -183,10 +183,12 @@ def _oak(file: _Reader) -> StereoCalibration:
         if socket not in cameras:
             raise file.error(f'holds no camera on socket {socket}, one of the stereo pair')
 
-    def to_root(socket: int) -> tuple[int, Array]:
-        """Return the last camera that a chain of extrinsics leads to, and T_last_socket."""
+    def to_root(socket: int, end: int) -> tuple[int, Array]:
+        """Return the camera `end`, or else the last one, that a chain of extrinsics leads to, and
+        T_last_socket.
+        """
         T, passed = np.eye(4), set()
-        while socket in cameras and socket not in passed:
+        while socket != end and socket not in passed:
             passed.add(socket)
             extrinsics = cameras[socket].get('extrinsics', {})
             onwards = int(extrinsics.get('toCameraSocket', -1))
@@ -198,7 +200,8 @@ def _oak(file: _Reader) -> StereoCalibration:
             T, socket = make_transform(R, t_m) @ T, onwards
         return socket, T
 
-    (left_root, T_root_left), (right_root, T_root_right) = to_root(left), to_root(right)
+    left_root, T_root_left = to_root(left, right)
+    right_root, T_root_right = to_root(right, left_root)
     if left_root != right_root:
         raise file.error('its extrinsics do not connect both cameras; calibrate the device again')
     intrinsics = []

@@ -69,6 +69,15 @@ def test_a_path_that_drifts_is_no_path_in_other_axes(tmp_path, caplog) -> None:
     assert not caplog.records
 
 
+def test_a_path_that_is_wrong_from_the_start_is_none_in_other_axes(tmp_path, caplog) -> None:
+    """Turned by 59 degrees to the side, as no optical axes are: that is an error."""
+    axes = Rotation.from_euler('z', 59, degrees=True).as_matrix()
+    truth = write(tmp_path / 'truth.txt', drive())
+    estimate = write(tmp_path / 'estimate.txt', in_axes(drive(), axes))
+    assert score_trajectory(match_files(estimate, truth)).rpe_translation_m > 0.5
+    assert not caplog.records
+
+
 @pytest.mark.parametrize(('unit', 'name'), [(10**3, 'ms'), (10**6, 'µs'), (10**9, 'ns')])
 @pytest.mark.parametrize('start_s', [0, 1_700_000_000])
 @pytest.mark.parametrize('form', ['{}', '{:.18e}'])

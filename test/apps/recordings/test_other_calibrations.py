@@ -100,7 +100,9 @@ def ost(path: Path) -> Path:
     return file
 
 
-def oak(path: Path, is_fisheye: bool = False, through_rgb: bool = False) -> Path:
+def oak(
+    path: Path, is_fisheye: bool = False, through_rgb: bool = False, both_ways: bool = False
+) -> Path:
     def extrinsics(T: np.ndarray, socket: int) -> dict:
         place = dict(zip('xyz', (100 * T[:3, 3]).tolist(), strict=True))
         return {
@@ -118,8 +120,8 @@ def oak(path: Path, is_fisheye: bool = False, through_rgb: bool = False) -> Path
         2: extrinsics(T_rgb_right, 0),
         0: none,
     }
-    if through_rgb:
-        links[1] = extrinsics(T_rgb_right @ T_RIGHT_LEFT, 0)
+    if both_ways:
+        links[2] = extrinsics(invert(T_RIGHT_LEFT), 1)
     cameras = []
     for socket in (0, 1, 2):
         side = max(socket - 1, 0)
@@ -216,6 +218,7 @@ def kalibr(path: Path) -> Path:
 FILES: dict[str, tuple[Callable[[Path], Path], str]] = {
     'ZED': (zed_of_one_resolution, 'plumb_bob'),
     'ost.txt': (ost, 'plumb_bob'),
+    'OAK both ways': (lambda p: oak(p, both_ways=True), 'plumb_bob'),
     'OAK': (oak, 'plumb_bob'),
     'OAK through its colour camera': (lambda p: oak(p, through_rgb=True), 'plumb_bob'),
     'OAK fisheye': (lambda p: oak(p, is_fisheye=True), 'equidistant'),
