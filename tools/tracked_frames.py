@@ -65,8 +65,8 @@ def track_frames(
     with_mount: bool = True,
     on_progress: Callable[[int], None] = lambda _: None,
 ) -> TrackedFrames:
-    """Run SLAM over frames. with_mount: measure the camera's mount, as `segfloor run` does; else
-    the camera is the base, as with --no-map, and where no floor shows the mount.
+    """Run SLAM over frames. with_mount: results have the axes of the mount, as those of
+    `segfloor run`; else the camera is the base, as with --no-map, and where no floor shows it.
     """
     settings = configuration.stereo_slam
     mount = None if with_mount or settings.has_mount else CAMERA_AS_BASE

@@ -176,7 +176,7 @@ MOST_AT_BEGIN = 3 * SETTLED_FRAMES
 class LockstepRun:
     """One run of a source through the pipeline, with everything noted that the results folder
     needs. interrupted: ends the drive after the frame at which it is set. path_only: no map is
-    made, and no floor is looked for. watcher: sees the drive while it is under way. network:
+    made, nor floor masks. watcher: sees the drive while it is under way. network:
     looks at its images.
 
     note: what there is to say about the map that was to be saved. broken_off: why the recording

@@ -78,7 +78,7 @@ class ReplaySession:
     """One replay: starts the nodes in a graph of their own, follows them, and stops them.
 
     interrupt: ends it early. loaded: the map that `maps` names to go on with. path_only: no map is
-    made, and no floor is looked for. network: of `segfloor_masks`, if that runs, too.
+    made, nor floor masks. network: of `segfloor_masks`, if that runs, too.
     """
 
     configuration: Configuration

@@ -297,7 +297,7 @@ class DriveOptions(InputOptions):
         ),
     ] = False
     no_map: Annotated[
-        bool, typer.Option('--no-map', help='The path alone: no floor is looked for, no map made.')
+        bool, typer.Option('--no-map', help='The path alone: no floor masks and no map are made.')
     ] = False
     report: Annotated[
         bool,

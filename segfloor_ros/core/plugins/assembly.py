@@ -36,10 +36,10 @@ def make_slam(
     """Build stereo SLAM with the camera's mount: `mount` when it is known (from tf), else from
     the settings, and whatever the settings leave open is measured from the floor the camera
     sees. CAMERA_AS_BASE: it is measured, too, and tracking is the same, but results wait for none
-    and have the axes of the camera. background: adjust the map beside tracking. path_only: the
-    same for any other mount of a camera that cannot see a floor; else it raises InputError.
+    and have the axes of the camera. background: adjust the map beside tracking. path_only: a
+    frame that no camera on a robot has is treated so, too; else it raises InputError.
     """
-    is_frame = path_only and mount is not None and not is_mount(mount)
+    is_frame = path_only and mount is not None and bool(mount_fault(mount))
     base = mount if mount is CAMERA_AS_BASE or is_frame else None
     mount = None if base is not None else mount
     height_m, pitch_rad, roll_rad = (
@@ -62,7 +62,8 @@ def make_slam(
             left_m=settings.camera_left_m,
         )
     else:
-        check_mount(mount)
+        if fault := mount_fault(mount):
+            raise InputError(fault)
         meter = MountEstimator(camera, forward_m=mount.forward_m, left_m=mount.left_m, given=mount)
     slam = equipped_slam(camera, settings, mount, meter, times, background)
     slam.rig.base = base
@@ -74,38 +75,30 @@ LEAST_HEIGHT_M, MOST_UP_RAD, MOST_ROLL_RAD = 0.02, math.radians(30), math.radian
 """A camera that maps a floor is above it, and sees it upright."""
 
 
-def is_mount(mount: Mount) -> bool:
-    """Whether a camera can be mounted so."""
-    try:
-        check_mount(mount)
-    except InputError:
-        return False
-    return True
-
-
-def check_mount(mount: Mount) -> None:
-    """Raise InputError where a camera cannot be mounted so."""
+def mount_fault(mount: Mount) -> str:
+    """Return why a camera cannot be mounted so, and what to do; '' where it can."""
     pitch, roll = math.degrees(mount.pitch_rad), math.degrees(mount.roll_rad)
     place_m = mount.height_m, mount.forward_m, mount.left_m
     if not any(place_m) and pitch < -89.0:  # x and z of a frame are those of the camera
-        raise InputError(
+        return (
             'the frame of the base is the camera itself; set base_frame to the frame of the robot '
             'on the floor, e.g. base_link'
         )
     # Of a camera that looks straight down, roll and heading are one.
     is_rolled = mount.pitch_rad < STRAIGHT_DOWN_RAD and abs(mount.roll_rad) > MOST_ROLL_RAD
     if -mount.pitch_rad > MOST_UP_RAD or is_rolled:
-        raise InputError(
+        return (
             f'the camera would look down by {pitch:.0f} deg and be rolled by {roll:.0f} deg: its '
             'frame is no optical one (x right, y down, z ahead; REP-103); let its driver stamp the '
             'images with the optical frame, and put that below its body with roll -90, yaw -90 deg'
         )
     if mount.height_m < LEAST_HEIGHT_M:
-        raise InputError(
+        return (
             f'the camera would be {mount.height_m:.3f} m above the floor, on which the base frame '
             'lies; correct the height in the transform, or set base_frame to a frame on the floor, '
             'e.g. base_footprint'
         )
+    return ''
 
 
 def equipped_slam(

@@ -41,7 +41,7 @@ class StereoSlamNodeSettings(StereoSlamSettings, NodeSettings):
     )
     path_only: bool = setting(
         False,
-        'Poses alone: no floor is looked for; where the mount of the camera is not known, the base '
+        'Poses alone, without floor and map; where the mount of the camera is not known, the base '
         'is taken to be where the camera is.',
     )
     save_map: str = setting('', 'File that ~/save_map writes the whole map to.', live=True)
