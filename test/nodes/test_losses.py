@@ -20,6 +20,7 @@ from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectif
 from segfloor_ros.nodes.messages.diagnostics import HEALTH, LASTS_S, Level
 from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.topics import IMAGES, KEYFRAMES, PROFILES, TOPICS
+from segfloor_ros.nodes.shared.joining import StampJoiner
 from segfloor_ros.nodes.shared.reporter import LossCounter, loss_in_words, loss_level
 from segfloor_ros.nodes.slam_camera import PairQueue
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
@@ -92,6 +93,19 @@ def test_a_queue_that_runs_over_is_named_with_its_topic_and_the_node_goes_on(mak
     assert any(
         'cloud_labelling falls behind' in s.message for s in health(graph, 'cloud_labelling')
     )
+
+
+def test_small_images_without_a_partner_are_neither_kept_nor_said(make_graph) -> None:
+    """Of those only the latest counts; hours of a drive lose many."""
+    graph = make_graph()
+    node = graph.add(CloudLabellingNode())
+    joiner = StampJoiner(('frame/left/image_rect', 'frame/right/image_rect'), capacity=2)
+    for stamp_ns in range(50):
+        joiner.add('frame/left/image_rect', stamp_ns, None)
+        node.reporter.report_dropped(joiner, lambda _: 1)
+    assert joiner.take_dropped() == []
+    graph.until(lambda: health(graph, 'cloud_labelling'), 'a sign of life')
+    assert health(graph, 'cloud_labelling')[-1].values['dropped'] == '0'
 
 
 def test_what_comes_while_a_node_is_paused_is_not_lost(make_graph) -> None:
