@@ -4,11 +4,12 @@ Over drives with a known path, poses and covariances are taken as SLAM publishes
 corrections. The motion over a window of time is held against the true one. Its error is a twist e,
 and e^T C^-1 e is a chi-square of 6 degrees of freedom where the covariance C is true.
 
-What is published is the covariance P of each pose, not that of a motion. It is read in two ways;
-twists are those of the camera after the window, and A is the adjoint of the motion back:
+C = A P_a A^T + P_b + D, of twists of the camera after the window, where A is the adjoint of the
+motion back, P the covariance of each pose in the map around it, and D that of the drift of `odom`
+in between.
 
-    ends     C = A P_a A^T + P_b: the poses before and after err independently
-    later    C = P_b: the pose before is taken for exact
+The cameras of rendered drives are exact: errors of the calibration have no part in their D, unless
+the recording says nothing of it.
 
 The truth errs itself: C has its covariance, too, once for each end. Windows begin at every frame,
 so they overlap; those in which a frame is lost are left out.
@@ -41,6 +42,7 @@ from segfloor_ros.core.contracts import FrameResult, Mount
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.whole import read_json
 from segfloor_ros.core.geometry import Array, invert
+from segfloor_ros.core.slam.tracking.drift import covariance_at, in_axes
 from segfloor_ros.core.twists import adjoint, se3_logs
 from segfloor_ros.nodes.configuration import resolve
 from tools.plain_pnp import DATA, WIDTH, arrow
@@ -57,7 +59,6 @@ SCENES = 'corridor1', 'corridor2', 'ramp', 'rolling'
 DEPTH_M = 5.0
 """Range of the depth sensor of rendered drives: disparities with noise, over 5 cm."""
 
-READINGS = 'ends', 'later'
 LIMITS = {sigmas: float(chi2.isf(2 * norm.sf(sigmas), 6)) for sigmas in (3, 6)}
 """Of e^T C^-1 e: as improbable as 3 and 6 standard deviations of one figure, 20.1 and 51.9."""
 
@@ -81,14 +82,13 @@ TRUTH_SIGMA: dict[str, tuple[float, float]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One drive, window and reading. beyond_3, beyond_6: share of the windows that err by more than
+    """One drive and window. beyond_3, beyond_6: share of the windows that err by more than
     so many sigma. translation, rotation: median of the normalised squared errors per degree of
     freedom. error_m, error_deg: medians of the errors; sigma_m, sigma_deg: of what is claimed.
     """
 
     drive: str
     window_s: float
-    reading: str
     windows: int
     beyond_3: float
     beyond_6: float
@@ -100,20 +100,21 @@ class Row:
     sigma_deg: float
 
     @property
-    def key(self) -> tuple[str, float, str]:
+    def key(self) -> tuple[str, float]:
         """What tells a row from the others."""
-        return self.drive, self.window_s, self.reading
+        return self.drive, self.window_s
 
 
 @dataclasses.dataclass(frozen=True)
 class Published:
     """Poses of the camera T_odom_left (N, 4, 4), NaN where lost, and the covariance (N, 6, 6) of a
-    twist that is multiplied from the right, in the axes of the camera.
+    twist that is multiplied from the right, in the axes of the camera. drift: (N, 6, 10), of odom.
     """
 
     stamp_ns: Array
     T_odom_left: Array
     covariance: Array
+    drift: Array
 
 
 def consistency(
@@ -146,14 +147,14 @@ def consistency(
         typer.Option(help='Figures of an earlier --json: they stand before the arrows.'),
     ] = None,
 ) -> None:
-    """Print a row for each drive and window, and for each reading of the covariance."""
+    """Print a row for each drive and window."""
     before = read_rows(compare) if compare else {}
     configuration, start_s = resolve(None, assignments or ()), time.perf_counter()
     rows: list[Row] = []
     with announcing() as announce:
         for name in recordings or (*RECORDINGS, *SCENES):
-            for recorded in drives(name, data, cache, seed, limit, announce):
-                rows += measure(recorded, configuration, exact_truth, announce)
+            for recorded, is_exact in drives(name, data, cache, seed, limit, announce):
+                rows += measure(recorded, configuration, exact_truth, is_exact, announce)
                 if json_file:
                     document = {'rows': [dataclasses.asdict(row) for row in rows]}
                     json_file.write_text(json.dumps(document, indent=1))
@@ -164,11 +165,13 @@ def consistency(
 
 def drives(
     name: str, data: Path, cache: Path, seed: int, limit: int, announce: Announce
-) -> Iterator[Recorded]:
-    """Yield a recording, or a rendered scene as stereo and with depth."""
+) -> Iterator[tuple[Recorded, bool]]:
+    """Yield a recording, or a rendered scene as stereo and with depth; and whether its camera is
+    known exactly.
+    """
     path = Path(name) if Path(name).is_dir() else data / name
     if path.is_dir():
-        yield Recorded(path, cache, limit=limit)
+        yield Recorded(path, cache, limit=limit), False
         return
     if name not in shipped('scenes'):
         raise InputError(f'{name}: neither a recording nor a scene')
@@ -177,14 +180,20 @@ def drives(
     path.parent.mkdir(parents=True, exist_ok=True)
     on_start = partial(announce, f'rendering {path.name}')
     render_once(dataclasses.replace(scene, seed=seed), path, on_start=on_start)
-    yield Recorded(path, cache, limit=limit)
-    yield Recorded(path, cache, limit=limit, depth=True)
+    yield Recorded(path, cache, limit=limit), True
+    yield Recorded(path, cache, limit=limit, depth=True), True
 
 
 def measure(
-    recorded: Recorded, configuration: Configuration, exact_truth: bool, announce: Announce
+    recorded: Recorded,
+    configuration: Configuration,
+    exact_truth: bool,
+    is_exact: bool,
+    announce: Announce,
 ) -> list[Row]:
-    """Drive a recording and return its rows. Raises InputError where its truth is not known."""
+    """Drive a recording and return its rows. is_exact: its camera. Raises InputError where its
+    truth is not known.
+    """
     frames = recorded.frames()
     true = true_poses(recorded, [frame.stamp_ns for frame in frames])
     if true is None:
@@ -199,10 +208,9 @@ def measure(
     rows = []
     for window_s in WINDOWS_S:
         pairs = windows(published, window_s)
-        for reading in READINGS if len(pairs) else ():
-            e, C = errors(published, true, pairs, reading, np.diag(noise))
-            if len(e):
-                rows.append(summary(recorded.name, window_s, reading, e, C))
+        if len(pairs):
+            e, C = errors(published, true, pairs, np.diag(noise), is_exact)
+            rows += [summary(recorded.name, window_s, e, C)] if len(e) else []
     return rows
 
 
@@ -219,7 +227,8 @@ def as_published(results: Sequence[FrameResult], mount: Mount) -> Published:
     B = adjoint(invert(mount.T_base_left)) @ turns
     P = np.array([result.covariance for result in results])
     stamps = np.array([result.stamp_ns for result in results])
-    return Published(stamps, T_odom_base @ mount.T_base_left, B @ P @ np.swapaxes(B, 1, 2))
+    drift = np.array([result.drift for result in results])
+    return Published(stamps, T_odom_base @ mount.T_base_left, B @ P @ np.swapaxes(B, 1, 2), drift)
 
 
 def windows(published: Published, window_s: float) -> Array:
@@ -238,11 +247,11 @@ def windows(published: Published, window_s: float) -> Array:
 
 
 def errors(
-    published: Published, true: Array, pairs: Array, reading: str, truth_noise: Array
+    published: Published, true: Array, pairs: Array, truth_noise: Array, is_exact: bool = True
 ) -> tuple[Array, Array]:
     """Return the errors (M, 6) of motions as twists of the later camera, and the covariance (M, 6,
     6) that is claimed for them; without those whose true motion is not known. true: (N, 4, 4).
-    truth_noise: (6, 6), of each true pose.
+    truth_noise: (6, 6), of each true pose. is_exact: whether the calibration does not err.
     """
     a, b = pairs.T
     known = np.isfinite(true[a, 0, 0] + true[b, 0, 0])
@@ -251,10 +260,13 @@ def errors(
     e = se3_logs(invert(invert(true[a]) @ true[b]) @ T_a_b)
     A = adjoint(invert(T_a_b))
     At = np.swapaxes(A, 1, 2)
-    C = published.covariance[b] + A @ truth_noise @ At + truth_noise + LEAST * np.eye(6)
-    if reading == 'ends':
-        C = C + A @ published.covariance[a] @ At
-    return e, C
+    C = A @ (published.covariance[a] + truth_noise) @ At + published.covariance[b] + truth_noise
+    drift = published.drift[b] - published.drift[a]
+    drift[:, :, 6:] *= not is_exact
+    T_left_odom = invert(published.T_odom_left[b])
+    here = [in_axes(d, T) for d, T in zip(drift, T_left_odom, strict=True)]
+    of_drift = [covariance_at(d, np.eye(4)) for d in here]
+    return e, C + np.reshape(of_drift, (-1, 6, 6)) + LEAST * np.eye(6)
 
 
 def normalised(e: Array, C: Array) -> Array:
@@ -262,7 +274,7 @@ def normalised(e: Array, C: Array) -> Array:
     return np.asarray(np.einsum('mi,mi->m', e, np.linalg.solve(C, e[:, :, None])[:, :, 0]))
 
 
-def summary(drive: str, window_s: float, reading: str, e: Array, C: Array) -> Row:
+def summary(drive: str, window_s: float, e: Array, C: Array) -> Row:
     """Return the row of errors (M, 6) with their covariances (M, 6, 6)."""
     squared = normalised(e, C)
     sigmas = np.sqrt([np.trace(C[:, :3, :3], axis1=1, axis2=2),
@@ -277,25 +289,25 @@ def summary(drive: str, window_s: float, reading: str, e: Array, C: Array) -> Ro
         np.degrees(np.median(np.linalg.norm(e[:, 3:], axis=1))),
         np.degrees(np.median(sigmas[1])),
     )
-    return Row(drive, window_s, reading, len(e), *(round(float(value), 6) for value in figures))
+    return Row(drive, window_s, len(e), *(round(float(value), 6) for value in figures))
 
 
-def read_rows(file: Path) -> dict[tuple[str, float, str], Row]:
+def read_rows(file: Path) -> dict[tuple[str, float], Row]:
     """Return the rows of a file of --json."""
     rows = [Row(**fields) for fields in read_json(file, 'figures of tools.consistency')['rows']]
     return {row.key: row for row in rows}
 
 
-def table_of(rows: Sequence[Row], before: dict[tuple[str, float, str], Row]) -> Table:
+def table_of(rows: Sequence[Row], before: dict[tuple[str, float], Row]) -> Table:
     """Return a line for each row; figures of before stand before arrows."""
     heads = (
         'windows', '> 3 σ %', '> 6 σ %', 'translation', 'rotation', 'error mm', 'σ mm', 'error °',
         'σ °',
     )  # fmt: skip
-    table = figure_table('drive, window, reading', *heads)
+    table = figure_table('drive, window', *heads)
     for row in rows:
         then = _figures(before[row.key]) if row.key in before else [''] * len(heads)
-        name = f'{row.drive}, {row.window_s:g} s, {row.reading}'
+        name = f'{row.drive}, {row.window_s:g} s'
         table.add_row(name, *map(arrow, then, _figures(row)))
     table.caption = (
         'of true covariances 0.27 % of the windows are beyond 3 σ and none beyond 6; translation, '

@@ -27,6 +27,7 @@ from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
+from segfloor_ros.core.slam.tracking.drift import covariance_in_odom
 from segfloor_ros.nodes.messages import odometry as odometry_messages
 from segfloor_ros.nodes.messages import points, poses
 from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
@@ -183,8 +184,9 @@ class SlamTopics:
             message = odometry_messages.pose_with_covariance_message(*at, T_map_base, in_map)
             self._out.publish('pose' + suffix, message)
         at, T_odom_base = (result.stamp_ns, own.odom_frame), result.T_odom_base
+        in_odom = odometry_messages.never_certain(covariance_in_odom(result))
         odometry = odometry_messages.odometry_message(
-            *at, own.base_frame, T_odom_base, covariance, twist, of_twist
+            *at, own.base_frame, T_odom_base, in_odom, twist, of_twist
         )
         self._out.publish('odometry' + suffix, odometry)
 
