@@ -15,7 +15,7 @@ import numpy as np
 from segfloor_ros.core.contracts import FrameResult
 from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.slam.tracking.motion import CameraMotion
-from segfloor_ros.core.twists import adjoint, se3_log, skew
+from segfloor_ros.core.twists import adjoint, se3_exp, se3_log, skew
 
 AXIS_SIGMA_PX, SCALE_SIGMA = 0.7, 0.0017
 """Of a calibration: the principal point, and focal length and baseline as shares (Zhang, A flexible
@@ -63,10 +63,11 @@ class DriftMeter:
         if motion.state.is_lost:
             return
         T, is_blind = motion.T_odom_camera, motion.state.is_blind
-        A = adjoint(T)
+        self.drift, A = self.drift.copy(), adjoint(T)
         if self._T_odom_camera is not None:
             moved = se3_log(invert(self._T_odom_camera) @ T)
-            self.drift = self.drift + A @ np.hstack([np.zeros((6, 6)), self._miscalibrated(moved)])
+            halfway = adjoint(self._T_odom_camera @ se3_exp(moved / 2))
+            self.drift[:, 6:] += halfway @ self._miscalibrated(moved)
         errs = [motion.covariance] if is_keyframe else []
         errs += [self._of_stretch] if self._of_stretch is not None and not is_blind else []
         for covariance in errs:
