@@ -8,9 +8,6 @@ C = A P_a A^T + P_b + D, of twists of the camera after the window, where A is th
 motion back, P the covariance of each pose in the map around it, and D that of the drift of `odom`
 in between.
 
-The cameras of rendered drives are exact: errors of the calibration have no part in their D, unless
-the recording says nothing of it.
-
 The truth errs itself: C has its covariance, too, once for each end. Windows begin at every frame,
 so they overlap; those in which a frame is lost are left out.
 """
@@ -129,6 +126,14 @@ def consistency(
     exact_truth: Annotated[
         bool, typer.Option('--exact-truth', help='Take the truth of recordings for exact.')
     ] = False,
+    exact_camera: Annotated[
+        bool,
+        typer.Option(
+            '--exact-camera',
+            help='Take the calibration for exact, as that of rendered drives is: errors of it have '
+            'no part in the drift.',
+        ),
+    ] = False,
     assignments: Annotated[
         Optional[list[str]],  # noqa: UP045
         typer.Option(
@@ -153,8 +158,8 @@ def consistency(
     rows: list[Row] = []
     with announcing() as announce:
         for name in recordings or (*RECORDINGS, *SCENES):
-            for recorded, is_exact in drives(name, data, cache, seed, limit, announce):
-                rows += measure(recorded, configuration, exact_truth, is_exact, announce)
+            for recorded in drives(name, data, cache, seed, limit, announce):
+                rows += measure(recorded, configuration, exact_truth, exact_camera, announce)
                 if json_file:
                     document = {'rows': [dataclasses.asdict(row) for row in rows]}
                     json_file.write_text(json.dumps(document, indent=1))
@@ -165,13 +170,11 @@ def consistency(
 
 def drives(
     name: str, data: Path, cache: Path, seed: int, limit: int, announce: Announce
-) -> Iterator[tuple[Recorded, bool]]:
-    """Yield a recording, or a rendered scene as stereo and with depth; and whether its camera is
-    known exactly.
-    """
+) -> Iterator[Recorded]:
+    """Yield a recording, or a rendered scene as stereo and with depth."""
     path = Path(name) if Path(name).is_dir() else data / name
     if path.is_dir():
-        yield Recorded(path, cache, limit=limit), False
+        yield Recorded(path, cache, limit=limit)
         return
     if name not in shipped('scenes'):
         raise InputError(f'{name}: neither a recording nor a scene')
@@ -180,20 +183,18 @@ def drives(
     path.parent.mkdir(parents=True, exist_ok=True)
     on_start = partial(announce, f'rendering {path.name}')
     render_once(dataclasses.replace(scene, seed=seed), path, on_start=on_start)
-    yield Recorded(path, cache, limit=limit), True
-    yield Recorded(path, cache, limit=limit, depth=True), True
+    yield Recorded(path, cache, limit=limit)
+    yield Recorded(path, cache, limit=limit, depth=True)
 
 
 def measure(
     recorded: Recorded,
     configuration: Configuration,
     exact_truth: bool,
-    is_exact: bool,
+    exact_camera: bool,
     announce: Announce,
 ) -> list[Row]:
-    """Drive a recording and return its rows. is_exact: its camera. Raises InputError where its
-    truth is not known.
-    """
+    """Drive a recording and return its rows. Raises InputError where its truth is not known."""
     frames = recorded.frames()
     true = true_poses(recorded, [frame.stamp_ns for frame in frames])
     if true is None:
@@ -209,7 +210,7 @@ def measure(
     for window_s in WINDOWS_S:
         pairs = windows(published, window_s)
         if len(pairs):
-            e, C = errors(published, true, pairs, np.diag(noise), is_exact)
+            e, C = errors(published, true, pairs, np.diag(noise), exact_camera)
             rows += [summary(recorded.name, window_s, e, C)] if len(e) else []
     return rows
 
@@ -247,11 +248,11 @@ def windows(published: Published, window_s: float) -> Array:
 
 
 def errors(
-    published: Published, true: Array, pairs: Array, truth_noise: Array, is_exact: bool = True
+    published: Published, true: Array, pairs: Array, truth_noise: Array, exact_camera: bool = False
 ) -> tuple[Array, Array]:
     """Return the errors (M, 6) of motions as twists of the later camera, and the covariance (M, 6,
     6) that is claimed for them; without those whose true motion is not known. true: (N, 4, 4).
-    truth_noise: (6, 6), of each true pose. is_exact: whether the calibration does not err.
+    truth_noise: (6, 6), of each true pose. exact_camera: whether the calibration does not err.
     """
     a, b = pairs.T
     known = np.isfinite(true[a, 0, 0] + true[b, 0, 0])
@@ -262,7 +263,7 @@ def errors(
     At = np.swapaxes(A, 1, 2)
     C = A @ (published.covariance[a] + truth_noise) @ At + published.covariance[b] + truth_noise
     drift = published.drift[b] - published.drift[a]
-    drift[:, :, 6:] *= not is_exact
+    drift[:, :, 6:] *= not exact_camera
     T_left_odom = invert(published.T_odom_left[b])
     here = [in_axes(d, T) for d, T in zip(drift, T_left_odom, strict=True)]
     of_drift = [covariance_at(d, np.eye(4)) for d in here]

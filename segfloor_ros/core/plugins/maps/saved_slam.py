@@ -134,7 +134,8 @@ def last_pose_values(last: LastPose) -> dict[str, Any]:
 def last_pose_of(values: Mapping[str, Any]) -> LastPose:
     """Return what `last_pose_values` was made of. Raises InputError."""
     try:
-        arrays = {name: np.array(values[name], float) for name in LAST_ARRAYS if name in values}
+        values = {'drift': np.zeros((6, 10)), **values}  # kept by an earlier release
+        arrays = {name: np.array(values[name], float) for name in LAST_ARRAYS}
         wheels = tuple(WheelPose(int(ns), np.array(T, float)) for ns, T in values['wheels'])
         return LastPose(int(values['stamp_ns']), wheels=wheels, **arrays)
     except (KeyError, ValueError, TypeError):

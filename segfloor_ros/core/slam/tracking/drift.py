@@ -48,8 +48,9 @@ def in_axes(drift: Array, T: Array) -> Array:
 class DriftMeter:
     """Follows the drift of `odom`, frame by frame, in the axes of its first camera pose.
 
-    The points of a keyframe lie where the camera had it: each keyframe adds the covariance of its
-    own pose, and a stretch without images that of its end.
+    The points of a keyframe lie where the camera had it, and were measured no better than it is by
+    those of the one before: each keyframe adds the covariance of its own pose for both. A stretch
+    without images adds that of its end.
     """
 
     def __init__(self, focal_px: float) -> None:
@@ -68,7 +69,7 @@ class DriftMeter:
             moved = se3_log(invert(self._T_odom_camera) @ T)
             halfway = adjoint(self._T_odom_camera @ se3_exp(moved / 2))
             self.drift[:, 6:] += halfway @ self._miscalibrated(moved)
-        errs = [motion.covariance] if is_keyframe else []
+        errs = 2 * [motion.covariance] if is_keyframe else []
         errs += [self._of_stretch] if self._of_stretch is not None and not is_blind else []
         for covariance in errs:
             self.drift[:, :6] += A @ covariance @ A.T

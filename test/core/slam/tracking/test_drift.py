@@ -56,7 +56,7 @@ def place_and_turn(samples, T):
     return np.concatenate([samples[:, :3, 3] - T[:3, 3], se3_logs(turns)[:, 3:]], axis=1)
 
 
-def test_each_keyframe_adds_the_error_of_its_own_pose() -> None:
+def test_each_keyframe_adds_the_error_of_its_pose_and_of_the_points_before_it() -> None:
     rng = np.random.default_rng(1)
     covariance = uneven_covariance(rng)
     motion, meter = driven(arc(), covariance)
@@ -65,7 +65,8 @@ def test_each_keyframe_adds_the_error_of_its_own_pose() -> None:
     samples = np.tile(np.eye(4), (6000, 1, 1))
     for _ in range(STEPS):
         # The covariance is that of a twist before T_camera_world, whose inverse errs behind.
-        samples = samples @ STEP @ se3_exp(-drawn_errors(rng, covariance))
+        of_points, of_pose = (se3_exp(-drawn_errors(rng, covariance)) for _ in range(2))
+        samples = samples @ STEP @ of_points @ of_pose
     T = motion.T_odom_camera
     assert_spread(place_and_turn(samples, T), covariance_at(drift, T))
 
