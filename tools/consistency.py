@@ -39,7 +39,6 @@ from segfloor_ros.core.contracts import FrameResult, Mount
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.whole import read_json
 from segfloor_ros.core.geometry import Array, invert
-from segfloor_ros.core.slam.tracking.drift import covariance_at, in_axes
 from segfloor_ros.core.twists import adjoint, se3_logs
 from segfloor_ros.nodes.configuration import resolve
 from tools.plain_pnp import DATA, WIDTH, arrow
@@ -205,7 +204,7 @@ def measure(
     )
     sigma_m, sigma_deg = TRUTH_SIGMA.get(recorded.path.name, (0.0, 0.0))
     noise = np.repeat((sigma_m, math.radians(sigma_deg)), 3) ** 2 * (not exact_truth)
-    published = as_published(tracked.results, tracked.mount)
+    published = as_published(tracked.results, tracked.drift, tracked.mount)
     rows = []
     for window_s in WINDOWS_S:
         pairs = windows(published, window_s)
@@ -215,8 +214,8 @@ def measure(
     return rows
 
 
-def as_published(results: Sequence[FrameResult], mount: Mount) -> Published:
-    """Return poses and covariances of the camera from those of the base.
+def as_published(results: Sequence[FrameResult], drift: Array, mount: Mount) -> Published:
+    """Return poses and covariances of the camera from those of the base. drift: (N, 6, 10).
 
     The covariance of the base has the axes of `odom` at the base: turned to those of the base it is
     that of a twist from the right, and the adjoint of the mount brings it to the camera.
@@ -228,7 +227,6 @@ def as_published(results: Sequence[FrameResult], mount: Mount) -> Published:
     B = adjoint(invert(mount.T_base_left)) @ turns
     P = np.array([result.covariance for result in results])
     stamps = np.array([result.stamp_ns for result in results])
-    drift = np.array([result.drift for result in results])
     return Published(stamps, T_odom_base @ mount.T_base_left, B @ P @ np.swapaxes(B, 1, 2), drift)
 
 
@@ -264,10 +262,11 @@ def errors(
     C = A @ (published.covariance[a] + truth_noise) @ At + published.covariance[b] + truth_noise
     drift = published.drift[b] - published.drift[a]
     drift[:, :, 6:] *= not exact_camera
-    T_left_odom = invert(published.T_odom_left[b])
-    here = [in_axes(d, T) for d, T in zip(drift, T_left_odom, strict=True)]
-    of_drift = [covariance_at(d, np.eye(4)) for d in here]
-    return e, C + np.reshape(of_drift, (-1, 6, 6)) + LEAST * np.eye(6)
+    # Twists before a pose, as those behind it.
+    drift = adjoint(invert(published.T_odom_left[b])) @ drift
+    steps, calibration = np.split(drift, [6], axis=2)
+    C = C + steps @ np.swapaxes(adjoint(invert(published.T_odom_left[b])), 1, 2)
+    return e, C + calibration @ np.swapaxes(calibration, 1, 2) + LEAST * np.eye(6)
 
 
 def normalised(e: Array, C: Array) -> Array:

@@ -190,8 +190,7 @@ class Keyframe:
 @dataclass(frozen=True)
 class LastPose:
     """Where a drive was broken off: the last pose T_camera_world (4, 4) with its covariance (6, 6)
-    and velocity (6,), the correction of the odometry T_world_odom (4, 4), what wheels measured, and
-    the drift (6, 10) of `odom`.
+    and velocity (6,), the correction of the odometry T_world_odom (4, 4), and what wheels measured.
     """
 
     stamp_ns: int
@@ -200,7 +199,6 @@ class LastPose:
     covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
     velocity: Array = field(default_factory=lambda: np.zeros(6))
     wheels: tuple[WheelPose, ...] = ()
-    drift: Array = field(default_factory=lambda: np.zeros((6, 10)))
 
 
 @dataclass(frozen=True)
@@ -208,15 +206,14 @@ class FrameResult:
     """The outcome of one frame. tracked: whether there is a pose. T_odom_base: the base in the
     continuous `odom` frame; T_map_odom: the present correction, so that T_map_odom @
     T_odom_base is the base in `map` (REP-105). Both are the last known ones while lost.
-    covariance: (6, 6) of the base pose in the map around it, order x y z roll pitch yaw (m², rad²),
-    in the axes of odom. drift: (6, 10), how odom has gone astray since it began (see
-    `slam.tracking.drift`). reference_keyframe: stamp of the keyframe the pose is expressed against,
-    for correcting it later. state: words for people ('tracking', or why not). blind: whether the
-    pose is that of wheels or a gyroscope alone. keyframe: set when this frame became one. moving:
-    what moves, where this frame was searched for it. in_submap: whether it was mapped in a submap
-    beside the map: `tracked` where it was merged later. repeated: whether the left image is the one
-    before, bit for bit. outside: whether `map` is a frame of its own, for the map that was loaded
-    is not recognised yet.
+    covariance: (6, 6) of the base pose, order x y z roll pitch yaw (m², rad²), in the odom
+    frame. reference_keyframe: stamp of the keyframe the pose is expressed against, for
+    correcting it later. state: words for people ('tracking', or why not). blind: whether the pose
+    is that of wheels or a gyroscope alone. keyframe: set when
+    this frame became one. moving: what moves, where this frame was searched for it. in_submap:
+    whether it was mapped in a submap beside the map: `tracked` where it was merged later. repeated:
+    whether the left image is the one before, bit for bit. outside: whether `map` is a frame of its
+    own, for the map that was loaded is not recognised yet.
     """
 
     index: int
@@ -234,7 +231,6 @@ class FrameResult:
     in_submap: bool = False
     repeated: bool = False
     outside: bool = False
-    drift: Array = field(default_factory=lambda: np.zeros((6, 10)))
 
     @property
     def covariance_in_map(self) -> Array:

@@ -26,8 +26,8 @@ from segfloor_ros.core.errors import MapError, SettingsError
 from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.slam.drift import DriftMeter
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
-from segfloor_ros.core.slam.tracking.drift import covariance_in_odom
 from segfloor_ros.nodes.messages import odometry as odometry_messages
 from segfloor_ros.nodes.messages import points, poses
 from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
@@ -103,15 +103,18 @@ class SlamTopics:
     def begin(self, calibration: StereoCalibration, frames: CameraFrames) -> None:
         """Publish about this camera from now on. calibration: of the rectified images."""
         self._calibration, self.frames = calibration, frames
+        self._drift = DriftMeter(calibration.camera.fx)
 
     def publish_mount(self, mount: Mount) -> None:
         """Publish where the left camera sits on the base; the stamp tells for which map."""
         base, left = self._own.base_frame, self.frames.left
         message = poses.transform_message(self.map_start_ns, base, left, mount.T_base_left)
         self._out.publish('camera_mount', message)
+        self._drift.T_base_left = mount.T_base_left
 
     def publish(self, result: FrameResult) -> None:
         """Publish a frame's pose, none while there is none, and everything of a keyframe."""
+        self._drift.see(result, result.keyframe is not None)
         if result.tracked and result.stamp_ns != self._announced_ns:
             self._publish_pose(result)
         if result.moving is not None:
@@ -184,7 +187,7 @@ class SlamTopics:
             message = odometry_messages.pose_with_covariance_message(*at, T_map_base, in_map)
             self._out.publish('pose' + suffix, message)
         at, T_odom_base = (result.stamp_ns, own.odom_frame), result.T_odom_base
-        in_odom = odometry_messages.never_certain(covariance_in_odom(result))
+        in_odom = odometry_messages.never_certain(self._drift.covariance(result))
         odometry = odometry_messages.odometry_message(
             *at, own.base_frame, T_odom_base, in_odom, twist, of_twist
         )

@@ -105,7 +105,7 @@ def test_the_covariance_of_the_base_becomes_that_of_the_camera() -> None:
     tracked = FrameResult(
         0, 0, True, invert(T_camera_world), np.eye(4), root @ root.T, 50, 'tracking', 0
     )
-    published = as_published([in_map(tracked, MOUNT.T_base_left)], MOUNT)
+    published = as_published([in_map(tracked, MOUNT.T_base_left)], np.zeros((1, 6, 10)), MOUNT)
     np.testing.assert_allclose(published.covariance[0], root @ root.T, atol=1e-12)
     np.testing.assert_allclose(
         invert(MOUNT.T_base_left) @ published.T_odom_left[0], invert(T_camera_world), atol=1e-12

@@ -22,7 +22,6 @@ from segfloor_ros.core.contracts import (
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.rig import Rig
 from segfloor_ros.core.slam.thresholds import SEARCHED_FRAMES
-from segfloor_ros.core.slam.tracking.drift import in_axes
 from segfloor_ros.core.slam.tracking.track import Track
 from segfloor_ros.core.twists import adjoint
 
@@ -166,7 +165,6 @@ def in_map(result: FrameResult, T_map_world: Array) -> FrameResult:
         T_odom_base=T_map_world @ result.T_odom_base @ T_left_base,
         T_map_odom=T_map_world @ result.T_map_odom @ T_left_base,
         covariance=_covariance_of_base(result, T_map_world),
-        drift=in_axes(result.drift, T_map_world),
         keyframe=_keyframe_in_map(result.keyframe, T_map_world) if result.keyframe else None,
         moving=turned(result.moving, T_map_world) if result.moving else None,
     )

@@ -31,7 +31,6 @@ from segfloor_ros.core.slam.session import Parts, SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.snapshot import take_snapshot
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
-from segfloor_ros.core.slam.tracking.drift import DriftMeter
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 from segfloor_ros.core.slam.tracking.images import Images
 from segfloor_ros.core.slam.tracking.patch_alignment import sample_patches
@@ -88,7 +87,6 @@ class StereoSlam:
         self.session = plugins.session(
             Parts(self.map, self.front_end, self.back_end, self.sensors, self._moving, search, held)
         )
-        self._drift = DriftMeter(camera.fx)
         self._shows_nothing = False
         self.late_masks = plugins.late_masks(self.front_end, self.map, self._mask_dilation_px)
         self.announce: Callable[[FrameResult, StereoFrame, Region | None], None] | None = None
@@ -104,8 +102,7 @@ class StereoSlam:
         motion = self.front_end.motion
         if self.mount is None or motion.state.is_lost:
             return None
-        covariance, drift = self.session.covariance, self._drift.drift
-        return replace(motion.last_pose(), covariance=covariance, drift=drift)
+        return replace(motion.last_pose(), covariance=self.session.covariance)
 
     def add(self, measurement: Measurement) -> None:
         """Take in what wheels or an IMU measured; those up to a frame come before it."""
@@ -131,7 +128,6 @@ class StereoSlam:
         if track is not None or keyframe is not None:
             pose = self.front_end.motion.T_camera_world
             self._mount_search.look(frame, pose, keyframe is not None)
-        self._drift.see(self.front_end.motion, keyframe is not None)
         result = self._result(frame, track, fault, keyframe)
         if moves is not None:
             result = replace(result, moving=moves.points)
@@ -158,7 +154,6 @@ class StereoSlam:
         covariance that grows. Raises KeyError or ValueError for arrays that are no map.
         """
         self.session.load(arrays, last)
-        self._drift.drift = last.drift if last else self._drift.drift
         self.front_end.is_fixed = localize
         self.rig.base = None
         self._mount_search.use(mount)
@@ -302,7 +297,6 @@ class StereoSlam:
             in_submap=session.state.holds_results,
             repeated=self.front_end.repeats.is_repeated,
             outside=session.state is SessionState.OUTSIDE,
-            drift=self._drift.drift,
         )
 
     def _carried(self, frame: StereoFrame) -> FrameResult:

@@ -35,7 +35,7 @@ PLACES = ('point_xyz_world', 'keyframe_T_camera_world', 'keyframe_T_camera_follo
 BENT = 1e-3
 """Rotations that are off by more bend a map by as many metres per metre."""
 
-LAST_ARRAYS = ('T_camera_world', 'T_world_odom', 'covariance', 'velocity', 'drift')
+LAST_ARRAYS = ('T_camera_world', 'T_world_odom', 'covariance', 'velocity')
 
 LOST_IDS = 1_000_000
 """More than a drive gives to points after its map was kept for the last time: who goes on with that
@@ -134,7 +134,6 @@ def last_pose_values(last: LastPose) -> dict[str, Any]:
 def last_pose_of(values: Mapping[str, Any]) -> LastPose:
     """Return what `last_pose_values` was made of. Raises InputError."""
     try:
-        values = {'drift': np.zeros((6, 10)), **values}  # kept by an earlier release
         arrays = {name: np.array(values[name], float) for name in LAST_ARRAYS}
         wheels = tuple(WheelPose(int(ns), np.array(T, float)) for ns, T in values['wheels'])
         return LastPose(int(values['stamp_ns']), wheels=wheels, **arrays)
