@@ -74,11 +74,10 @@ COMMANDS = {
 """Where each command is, and what it does, in the words of its own help."""
 
 EXTRAS = {
-    'evo': 'cli', 'junitparser': 'cli', 'matplotlib': 'cli', 'rosbags': 'cli',
-    'distributed': 'cluster', 'fsspec': 'cluster', 'mujoco': 'sim', 'onnxruntime': 'onnx',
-    'rerun': 'view', 'rclpy': 'ros',
+    'evo': 'evaluate', 'distributed': 'cluster', 'fsspec': 'cluster', 'mujoco': 'sim',
+    'onnxruntime': 'onnx', 'rerun': 'view', 'rclpy': 'ros',
 }  # fmt: skip
-"""The extra of setup.py that has a package."""
+"""The extra of setup.py that has a package; the others come with the wheel."""
 
 BY_APT = {'matplotlib', 'numpy', 'scipy', 'yaml'}
 """Packages that Ubuntu has as python3-NAME."""
