@@ -431,9 +431,17 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         *_mount_rows(summary.camera_height_m, summary.camera_pitch_rad),
         ('time', f'{summary.wall_s:.1f} s ({summary.frames_per_s:.1f} frames/s)'),
         ('memory, peak', f'{summary.rss_mb["peak"]:.0f} MB'),
-        ('memory per map update', f'{summary.rss_mb["slope_per_update"]:.3f} MB'),
+        ('memory per map update', memory_growth(summary.rss_mb)),
     ]
     return [(what, str(value)) for what, value in rows if value is not None]
+
+
+def memory_growth(rss_mb: Mapping[str, Any]) -> str:
+    """Return by how much the memory grows with each map update, in words; a slope below zero is
+    memory that was freed.
+    """
+    words = f'{max(rss_mb["slope_per_update"], 0):.3f} MB'
+    return 'none' if words == '0.000 MB' else words
 
 
 def _mount_rows(height_m: float | None, pitch_rad: float | None) -> list[tuple[str, str]]:

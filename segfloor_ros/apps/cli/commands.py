@@ -94,7 +94,10 @@ def run(
         if drive.broken_off is not None:
             remarks.append(f'{drive.broken_off}; the map is of what came before')
             status = status or 2
-        terminal.finish_run(options.input, options.out, folder, options.report, remarks, status)
+        figures = result.summary if options.as_json else None
+        terminal.finish_run(
+            options.input, options.out, folder, options.report, remarks, status, figures
+        )
 
 
 @contextmanager
@@ -172,8 +175,9 @@ def replay(
             f'keyframes that failed: {found.failed_keyframes}'
         )
         status = interrupt.status or found.status
+        figures = result.summary if options.as_json else None
         terminal.finish_run(
-            options.input, options.out, folder, options.report, found.notices, status
+            options.input, options.out, folder, options.report, found.notices, status, figures
         )
 
 
@@ -285,6 +289,7 @@ def simulate(
             '--list', help='List the shipped scenes.', callback=_list_scenes, is_eager=True
         ),
     ] = False,
+    as_json: terminal.Json = False,
 ) -> None:
     """Render a drive with exact truth: images, calibration, poses, map and floor masks.
 
@@ -307,11 +312,12 @@ def simulate(
         terminal.progress_bar('rendering', simulation.frame_count) as progress,
     ):
         record(simulation, out, wanted, progress)
-        seconds = simulation.drive.times_s[-1]
-        facts = (
-            f'{simulation.frame_count} pairs, {simulation.drive.length_m:.1f} m, {seconds:.0f} s'
-        )
-    console.print(f'{facts}: {out}')
+        pairs, drive = simulation.frame_count, simulation.drive
+    seconds = float(drive.times_s[-1])
+    if as_json:
+        facts = {'pairs': pairs, 'path_m': drive.length_m, 'duration_s': seconds, 'out': str(out)}
+        return terminal.print_json(facts)
+    console.print(f'{pairs} pairs, {drive.length_m:.1f} m, {seconds:.0f} s: {out}')
 
 
 @terminal.with_options

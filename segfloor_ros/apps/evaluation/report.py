@@ -24,7 +24,13 @@ from segfloor_ros.apps.evaluation.report_pictures import (
     read_run,
     v_disparity_picture,
 )
-from segfloor_ros.apps.results_folder import REPORT, SEMANTIC, STAGE_COLUMNS, stage_rows
+from segfloor_ros.apps.results_folder import (
+    REPORT,
+    SEMANTIC,
+    STAGE_COLUMNS,
+    memory_growth,
+    stage_rows,
+)
 from segfloor_ros.core.errors import os_errors
 from segfloor_ros.core.files.whole import read_bytes
 from segfloor_ros.core.files.writing import MARK, add_files
@@ -67,6 +73,7 @@ def calibration_page(
     seen = 'Corners in the left and the right image; orange: those of the worst pair'
     content = [
         _fact_row([(value, name) for name, value in figures]),
+        _section('What to do next', _list(result.advice) if result.advice else ''),
         _section('Left out', html.escape(result.left_out)),
         _section('Where the board was seen', _figure(coverage_picture(result), seen)),
         _section('Errors', _table(('pair', 'left px', 'right px', 'rows px', ''), rows, shares)),
@@ -257,14 +264,13 @@ def _table(names: tuple[str, ...], rows: list[list[str]], shares: list[float]) -
 
 def _memory(summary: dict[str, Any]) -> str:
     memory = summary.get('rss_mb', {})
-    words = (
-        ('start', 'MB at the start'),
-        ('peak', 'MB at most'),
-        ('slope_per_update', 'MB more per map update'),
-    )
-    facts = [(f'{memory[key]:.2f}', text) for key, text in words if key in memory]
-    if not facts:
+    if not memory:
         return ''
+    facts = [
+        (f'{memory["start"]:.0f} MB', 'at the start'),
+        (f'{memory["peak"]:.0f} MB', 'at most'),
+        (memory_growth(memory), 'more per map update'),
+    ]
     picture = memory_picture(memory)
     drawn = _figure(picture, 'Memory over the map updates') if picture else ''
     return _fact_row(facts) + drawn

@@ -13,6 +13,8 @@ from rich.text import Text
 
 from segfloor_ros.apps.cli.main import COMMANDS, program
 from segfloor_ros.apps.cli.terminal import params_file, shipped_params
+from segfloor_ros.apps.simulation.scene_file import open_scene, shipped
+from segfloor_ros.core.errors import InputError
 from segfloor_ros.nodes.configuration import resolve
 
 
@@ -50,6 +52,14 @@ def test_a_help_opens_with_examples_that_the_command_takes(name):
         command = next(SINGLE[n] for n in (words[0], ' '.join(words[:2])) if n in SINGLE)
         known = {option for p in command.params for option in p.opts}
         assert {word for word in words if word.startswith('--')} <= known, example
+
+
+def test_the_example_of_simulate_can_be_run_again_beside_what_came_of_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'corridor1').mkdir()
+    assert open_scene('corridor1') == open_scene(str(shipped()['corridor1']))
+    with pytest.raises(InputError, match='is a folder'):
+        open_scene('.')
 
 
 def test_scenes_are_listed_with_a_line_each():

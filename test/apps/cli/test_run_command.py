@@ -15,6 +15,7 @@ from stereo_room import MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.apps.evaluation.report import write_report
 from segfloor_ros.apps.map_files import load_map
+from segfloor_ros.apps.results_folder import memory_growth
 from segfloor_ros.core.files.results import read_map_file
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED
 from segfloor_ros.core.slam.settings import StereoSlamSettings
@@ -427,6 +428,21 @@ def test_a_report_on_a_cloud_that_cannot_be_read_ends_with_status_2(result, tmp_
         assert done.returncode == 2
         assert len(done.stderr.strip().splitlines()) == 1
         assert 'labelled_cloud.ply' in done.stderr
+
+
+def test_the_figures_of_a_run_are_printed_as_json_alone(recording, tmp_path):
+    done = segfloor('run', recording, '--out', tmp_path / 'out', '--no-map', '--json')
+    assert done.returncode == 0, done.stderr
+    printed = json.loads(done.stdout)
+    assert printed.pop('out') == str(tmp_path / 'out')
+    assert printed == json.loads((tmp_path / 'out' / 'summary.json').read_text())
+
+
+@pytest.mark.parametrize(
+    ('slope', 'words'), [(-0.011, 'none'), (0.0002, 'none'), (0.0149, '0.015 MB')]
+)
+def test_memory_that_is_freed_is_no_growth(slope, words):
+    assert memory_growth({'slope_per_update': slope}) == words
 
 
 FAULT = {'fault': 'rows_apart', 'value': 3.2, 'unit': 'px', 'remedy': 'calibrate again'}
