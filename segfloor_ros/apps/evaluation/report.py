@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -35,6 +36,7 @@ from segfloor_ros.core.errors import os_errors
 from segfloor_ros.core.files.whole import read_bytes
 from segfloor_ros.core.files.writing import MARK, add_files
 from segfloor_ros.core.floor.pictures import MASK_COLOURS
+from segfloor_ros.core.floor.plane.plane import LOOKS, SURE, SWAY
 
 NO_TEXT = re.compile('[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]')
 """In names of files: what controls a terminal, and bytes that are not UTF-8."""
@@ -113,7 +115,7 @@ def html_page(title: str, about: str, content: str, style: str = '') -> bytes:
 
 def _facts(data: ReportData) -> str:
     summary = data.summary
-    height_m = summary['camera_height_m']
+    height_m, floor = summary['camera_height_m'], summary.get('floor')
     tracked = 100 * summary['tracked_frames'] / max(1, summary['frames'])
     facts = [
         (f'{summary["frames"]}', 'frames'),
@@ -124,6 +126,11 @@ def _facts(data: ReportData) -> str:
         (f'{summary["map_updates"]}', 'map updates'),
         (f'{summary["frames_per_s"]:.1f}', 'frames per second'),
         *([] if height_m is None else [(f'{height_m:.3f} m', 'camera above the floor')]),
+        *(
+            [(f'{floor["median_m"]:.3f} m', 'by single keyframes')]
+            if floor and floor['planes']
+            else []
+        ),
     ]
     return _fact_row(facts) + _scores(data)
 
@@ -141,6 +148,7 @@ def advice(data: ReportData) -> list[str]:
         for fault in summary.get('input_faults', [])
     ]
     lines += summary.get('sensor_remarks', [])
+    lines += _doubts(summary)
     if summary['camera_height_m'] is None:
         lines.append(
             'the mount of the camera stayed unknown, so there is no map: let it see level floor at '
@@ -178,6 +186,45 @@ def advice(data: ReportData) -> list[str]:
             '(stereo_slam.num_features) are faster'
         )
     return lines or ['nothing: the figures are sound']
+
+
+def _doubts(summary: Mapping[str, Any]) -> list[str]:
+    """Return why the map may not be that of the whole drive, or not of the floor, each in a line.
+
+    A robot sways: the median of N heights above the planes of keyframes has the standard deviation
+    1.25 `SWAY` / sqrt(N), as that of N normal values. What differs by more than three of these does
+    not come from swaying.
+    """
+    lines = []
+    tracked, frames = summary['tracked_frames'], summary['frames']
+    if tracked < frames:
+        lines.append(
+            f'{tracked} of {frames} frames ({tracked / frames:.0%}) are in the map: it shows a '
+            'part of the drive'
+        )
+    if summary.get('interrupted'):
+        lines.append('the drive was cut short: the map shows what came before')
+    height_m, floor = summary['camera_height_m'], summary.get('floor')
+    if height_m is None or floor is None:
+        return lines
+    if floor['planes'] < LOOKS < summary['keyframes']:
+        return [
+            *lines,
+            f'{floor["planes"]} of {summary["keyframes"]} keyframes show the plane of the floor: '
+            'too few to check the height of the camera',
+        ]
+    sigma_m = 1.25 * SWAY[2] * height_m / math.sqrt(floor['planes'])
+    if abs(floor['median_m'] - height_m) > SURE * sigma_m:
+        lines.append(
+            f'the mount says that the camera is {height_m:.3f} m above the floor, single keyframes '
+            f'show {floor["median_m"]:.3f} m: measure it, and give stereo_slam.camera_height_m'
+        )
+    if abs(floor['last_m'] - floor['first_m']) > SURE * math.sqrt(2 * 3) * sigma_m:
+        lines.append(
+            f'the height of the camera above the floor changes from {floor["first_m"]:.3f} to '
+            f'{floor["last_m"]:.3f} m along the drive: is it fixed to the robot?'
+        )
+    return lines
 
 
 def _scores(data: ReportData) -> str:
