@@ -212,16 +212,20 @@ def _print_scores(out: Path) -> None:
     """Print how good map and path are; the last line is the path of the report."""
     # Imported here: evo and matplotlib take a second that no other command should wait for.
     from segfloor_ros.apps.evaluation.report import write_report
-    from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
 
     truth = load_truth(DRIVE)
     grid = load_map(out / 'map.yaml')
     console.print(map_table(score_map(grid, truth)))
-    path = score_trajectory(match_files(out, DRIVE))
-    console.print(
-        f'path: {path.path_length_m:.1f} m, {100 * path.tracked:.1f} % of the frames tracked, '
-        f'error {100 * path.ate_rmse_m:.1f} cm (RMSE after alignment)'
-    )
+    try:
+        from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
+    except ModuleNotFoundError:  # evo is an extra
+        console.print("path: its error is measured after pip install 'segfloor_ros[evaluate]'")
+    else:
+        path = score_trajectory(match_files(out, DRIVE))
+        console.print(
+            f'path: {path.path_length_m:.1f} m, {100 * path.tracked:.1f} % of the frames tracked, '
+            f'error {100 * path.ate_rmse_m:.1f} cm (RMSE after alignment)'
+        )
     add_files(out, {'overlay.png': overlay_png(compare(grid, truth))})
     console.print(f'map on the truth: {out / "overlay.png"}', soft_wrap=True)
     console.print(str(write_report(out, DRIVE)), soft_wrap=True)

@@ -175,10 +175,12 @@ def run_app(make_app: Callable[[], typer.Typer]) -> None:
     logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
     status: str | int | None = 0
     try:
+        from segfloor_ros.apps.cli.help_panels import laid_out
+
         app = make_app()
         signal.signal(signal.SIGINT, signal.default_int_handler)
         with terminated_like_interrupted():
-            app(args=with_optional_values(sys.argv[1:]))
+            laid_out(app)(args=with_optional_values(sys.argv[1:]))
     except SystemExit as ended:
         status = ended.code
     except KeyboardInterrupt:

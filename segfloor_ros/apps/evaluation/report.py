@@ -233,12 +233,18 @@ def _scores(data: ReportData) -> str:
         return ''
     facts = _map_facts(score_map(data.grid, data.truth))
     if data.truth_folder is not None and (data.truth_folder / 'poses.txt').is_file():
-        # Imported here: evo is needed for this alone.
-        from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
-
-        path = score_trajectory(match_files(data.folder, data.truth_folder))
-        facts.append((f'{path.ate_rmse_m:.3f} m', f'path error over {path.path_length_m:.1f} m'))
+        facts.append(_path_fact(data.folder, data.truth_folder))
     return '<h2>Against the truth</h2>' + _fact_row(facts)
+
+
+def _path_fact(run: Path, truth: Path) -> tuple[str, str]:
+    # Imported here: evo is needed for this alone, and is an extra.
+    try:
+        from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
+    except ModuleNotFoundError:
+        return '–', "path error: pip install 'segfloor_ros[evaluate]'"
+    path = score_trajectory(match_files(run, truth))
+    return f'{path.ate_rmse_m:.3f} m', f'path error over {path.path_length_m:.1f} m'
 
 
 def _map_facts(score: MapScore) -> list[tuple[str, str]]:

@@ -11,6 +11,7 @@ import typer
 from command_line import segfloor
 from rich.text import Text
 
+from segfloor_ros.apps.cli.help_panels import ADVANCED, BASIC, lay_out
 from segfloor_ros.apps.cli.main import COMMANDS, program
 from segfloor_ros.apps.cli.terminal import params_file, shipped_params
 from segfloor_ros.apps.simulation.scene_file import open_scene, shipped
@@ -35,6 +36,17 @@ def test_no_word_of_a_help_is_taken_for_markup(name):
     for parameter in ALL[name].params:
         words = getattr(parameter, 'help', None) or ''
         assert Text.from_markup(words).plain == words, parameter.name
+
+
+@pytest.mark.parametrize('name', SINGLE)
+def test_a_help_shows_eight_options_at_most_before_the_advanced_ones(name):
+    lay_out(SINGLE[name], name)
+    options = [p for p in SINGLE[name].params if p.opts[0].startswith('-')]
+    basic = {p.opts[0] for p in options if p.rich_help_panel is None}
+    assert len(basic) <= 8
+    if name in BASIC:
+        assert basic == {*BASIC[name].split()}
+        assert {p.rich_help_panel for p in options} == {None, ADVANCED}
 
 
 @pytest.mark.parametrize('name', COMMANDS)

@@ -9,6 +9,7 @@ import pytest
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.apps.cli.main import COMMANDS
+from segfloor_ros.apps.cli.main import EXTRAS as PACKAGES
 
 EXTRAS = (
     'evo', 'junitparser', 'rosbags', 'mujoco', 'rerun', 'onnxruntime', 'distributed', 'fsspec',
@@ -64,6 +65,14 @@ def test_a_recording_is_mapped_without_extras(tmp_path) -> None:
     done = without(EXTRAS, 'run', drive, '--no-map', '--out', tmp_path / 'out')
     assert done.returncode == 0, done.stderr
     assert (tmp_path / 'out' / 'trajectory.txt').exists()
+
+
+@pytest.mark.slow
+def test_the_demo_runs_and_scores_the_map_without_extras(tmp_path):
+    done = without(tuple(PACKAGES), 'demo', '--lockstep', '--out', tmp_path / 'demo')
+    assert done.returncode == 0, done.stderr
+    assert "path: its error is measured after pip install 'segfloor_ros[evaluate]'" in done.stdout
+    assert 'segfloor_ros[evaluate]' in (tmp_path / 'demo' / 'report.html').read_text()
 
 
 @pytest.mark.parametrize(
