@@ -126,12 +126,9 @@ def _facts(data: ReportData) -> str:
         (f'{summary["map_updates"]}', 'map updates'),
         (f'{summary["frames_per_s"]:.1f}', 'frames per second'),
         *([] if height_m is None else [(f'{height_m:.3f} m', 'camera above the floor')]),
-        *(
-            [(f'{floor["median_m"]:.3f} m', 'by single keyframes')]
-            if floor and floor['planes']
-            else []
-        ),
     ]
+    if floor is not None and floor['planes']:
+        facts.append((f'{floor["median_m"]:.3f} m', 'above it by single keyframes'))
     return _fact_row(facts) + _scores(data)
 
 

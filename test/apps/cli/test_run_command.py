@@ -473,7 +473,10 @@ SUBMAP = {'first_frame': 4, 'last_frame': 9, 'merged': False}
         ({'floor': heights(1.01, 1.0, 1.02)}, 'nothing: the figures are sound'),
         ({'floor': heights(1.1, 1.1, 1.1)}, 'the mount says that the camera is 1.000 m above the'),
         ({'floor': heights(1.0, 0.95, 1.05)}, 'the height of the camera above the floor changes'),
-        ({'floor': {'planes': 2}, 'keyframes': 30}, '2 of 30 keyframes show the plane'),
+        (
+            {'floor': heights(1.0, 1.0, 1.0) | {'planes': 2}, 'keyframes': 30},
+            '2 of 30 keyframes show the plane',
+        ),
         ({'floor': None}, 'nothing: the figures are sound'),
     ],
 )
