@@ -111,35 +111,40 @@ def open_view(
             raise SettingsError(f'{target}: the file of a view ends in {SUFFIX}')
         check_output(Path(target), VIEW, inputs, '--view')
         stream.save(target)
-    else:
-        has_display = bool(os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'))
-        server = _start_viewer(stream, has_display)
-    try:
-        yield View(Canvas(stream, rerun))
-        stream.flush()
-        if target:
-            console.print(f'view: {target}, for the command rerun', highlight=False, soft_wrap=True)
-        elif not has_display:
+        with _flushed(stream):
+            yield View(Canvas(stream, rerun))
+        console.print(f'view: {target}, for the command rerun', highlight=False, soft_wrap=True)
+        return
+    with _viewer() as (server, address, is_page):
+        stream.connect_grpc(address)
+        with _flushed(stream):
+            yield View(Canvas(stream, rerun))
+        if is_page:
             console.print('the view is there until Ctrl-C')
             with suppress(KeyboardInterrupt):
                 server.wait()
+
+
+@contextmanager
+def _flushed(stream: Any) -> Iterator[None]:
+    try:
+        yield
     finally:
         stream.flush()
-        if not (target or has_display):
-            with suppress(ProcessLookupError):
-                os.killpg(server.pid, signal.SIGTERM)  # rerun_cli starts the viewer as its child
-            server.wait()
 
 
-def _start_viewer(stream: Any, has_display: bool) -> subprocess.Popen[bytes]:
-    """Start the viewer of rerun for a stream, as a window or as a page for the browser. It listens
-    on this machine alone; what rerun starts by itself listens on all networks.
+@contextmanager
+def _viewer() -> Iterator[tuple[subprocess.Popen[bytes], str, bool]]:
+    """Start the viewer of rerun: a window, or without a display a page for the browser, which ends
+    with the block. It listens on this machine alone; what rerun starts by itself listens on all
+    networks. Yields its process, where it takes a stream, and whether it is a page.
     """
+    is_page = not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'))
     words = [sys.executable, '-m', 'rerun_cli', '--bind', LOCALHOST]
     port = _free_port()
     words += ['--port', str(port)]
     address = f'rerun+http://{LOCALHOST}:{port}/proxy'
-    if not has_display:
+    if is_page:
         web_port = _free_port(WEB_PORT)
         words += ['--serve-web', '--web-viewer-port', str(web_port)]
         page = f'http://{LOCALHOST}:{web_port}?url={quote(address, safe="")}'
@@ -149,8 +154,13 @@ def _start_viewer(stream: Any, has_display: bool) -> subprocess.Popen[bytes]:
     server = subprocess.Popen(
         words, stdin=nowhere, stdout=nowhere, stderr=nowhere, start_new_session=True
     )
-    stream.connect_grpc(address)
-    return server
+    try:
+        yield server, address, is_page
+    finally:
+        if is_page:
+            with suppress(ProcessLookupError):
+                os.killpg(server.pid, signal.SIGTERM)  # rerun_cli starts the viewer as its child
+            server.wait()
 
 
 def _free_port(wanted: int = 0) -> int:
