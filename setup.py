@@ -71,6 +71,7 @@ setup(
             'robot.xml',
         ],
         f'{PACKAGE}.apps.evaluation': ['report.css'],
+        f'{PACKAGE}.apps.cli': ['map_editor.html'],
         f'{PACKAGE}.nodes': ['fastdds.xml'],
         f'{PACKAGE}.core.slam.places': ['vocabulary.npy'],
     },

@@ -69,7 +69,7 @@ COMMANDS = {
         'Map recordings and hold the results against bounds. Status 1: a bound failed.',
     ),
     'evaluate': ('evaluate:app', 'Score a map, a trajectory or floor masks against the truth.'),
-    'map': ('maps:app', 'Look at saved maps, compare, merge and prune them.'),
+    'map': ('maps:app', 'Look at saved maps, compare, merge, prune and correct them.'),
 }
 """Where each command is, and what it does, in the words of its own help."""
 
