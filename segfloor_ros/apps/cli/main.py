@@ -27,8 +27,8 @@ COMMANDS = {
     'replay': ('commands:replay', 'Map a recording with the five ROS 2 nodes over DDS.'),
     'info': (
         'recordings:info',
-        'Say what an input is, and whether it will do: topics or folders, rates, gaps, '
-        'calibration, sensors, and what some dozens of pairs show to be wrong, with what to do.',
+        'Describe an input, and whether it can be mapped: topics or folders, rates, gaps, '
+        'calibration, sensors, and faults that some dozens of pairs show, with remedies.',
     ),
     'view': (
         'recordings:view',

@@ -74,7 +74,7 @@ def info(
     path: Annotated[Path, typer.Argument(metavar='FILE', help='File of --save-map, or map.yaml.')],
     as_json: Json = False,
 ) -> None:
-    """Say what a saved map holds: drives with dates, keyframes, areas, camera; of a map.yaml size,
+    """Describe a saved map: drives with dates, keyframes, areas, camera; of a map.yaml size,
     areas and resolution.
 
     \b

@@ -56,8 +56,8 @@ def info(
     depth: terminal.Depth = False,
     as_json: terminal.Json = False,
 ) -> None:
-    """Say what an input is, and whether it will do: topics or folders, rates, gaps, calibration,
-    sensors, and what some dozens of pairs show to be wrong, with what to do.
+    """Describe an input, and whether it can be mapped: topics or folders, rates, gaps, calibration,
+    sensors, and faults that some dozens of pairs show, with remedies.
 
     \b
     segfloor info drive.mcap
@@ -442,7 +442,7 @@ def _check_calibration(source: StereoSource, board: Board | None, as_json: bool)
     if found.scale is not None and board is not None:
         true_m = board.diagonal_m
         length = f'{found.scale * true_m:.4f} m for {true_m:.4f} m, in {found.boards} pairs'
-    figures = [('pairs', str(found.pairs)), ('row error', rows), ('lag between the eyes', lag)]
+    figures = [('pairs', str(found.pairs)), ('row error', rows), ('lag between the cameras', lag)]
     figures += [] if board is None else [('first to last corner of the board', length)]
     console.print(value_table('calibration', figures, source.name))
     if as_json:

@@ -297,12 +297,11 @@ class DriveOptions(InputOptions):
         typer.Option('--save-masks', help='Floor masks to save; all of them by run only.'),
     ] = SaveMasks.keyframes
     save_map: Annotated[
-        Path | None,
-        typer.Option('--save-map', help='File to save the whole map to, to go on with later.'),
+        Path | None, typer.Option('--save-map', help='File for the whole map, to continue later.')
     ] = None
-    load_map: Annotated[
-        Path | None, typer.Option('--load-map', help='Saved map to go on mapping in.')
-    ] = None
+    load_map: Annotated[Path | None, typer.Option('--load-map', help='Saved map to continue.')] = (
+        None
+    )
     localize: Annotated[
         bool,
         typer.Option(
