@@ -30,6 +30,8 @@ def test_a_converted_recording_has_the_same_frames(tmp_path):
     done = segfloor('convert', folder, tmp_path / 'drive.mcap', '--images', 'png')
     assert done.returncode == 0, done.stderr
     assert '4 pairs' in done.stdout
+    done = segfloor('convert', folder, tmp_path / 'again.mcap', '--frames', 3, '--json')
+    assert json.loads(done.stdout)['pairs'] == 3
     source = open_source(StereoCameraSettings(input=str(tmp_path / 'drive.mcap')))
     for frame, original in zip(source.frames(), frames, strict=True):
         assert frame.stamp_ns == original.stamp_ns
