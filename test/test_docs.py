@@ -26,141 +26,141 @@ SIMULATION = (DOCS / 'simulation.md').read_text()
 
 
 def fields_of(kind: type) -> dict[str, set[str]]:
- not a number is itself nowhere else  """Return the names of a description's entries and, below each, those of its parts."""
- not a number is itself nowhere else  found = {}
- not a number is itself nowhere else  for name, hint in typing.get_type_hints(kind, vars(scene_module)).items():
- not a number is itself nowhere else      inner = next(
- not a number is itself nowhere else          (k for k in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(k)), None
- not a number is itself nowhere else      )
- not a number is itself nowhere else      found[name] = {f.name for f in dataclasses.fields(inner)} if inner else set()
- not a number is itself nowhere else  return found
+    """Return the names of a description's entries and, below each, those of its parts."""
+    found = {}
+    for name, hint in typing.get_type_hints(kind, vars(scene_module)).items():
+        inner = next(
+            (k for k in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(k)), None
+        )
+        found[name] = {f.name for f in dataclasses.fields(inner)} if inner else set()
+    return found
 
 
 def table_rows(text: str) -> list[set[str]]:
- not a number is itself nowhere else  """Return the names in code style of every table row."""
- not a number is itself nowhere else  lines = [line for line in text.splitlines() if line.startswith('|')]
- not a number is itself nowhere else  return [set(re.findall(r'`([a-z0-9_]+)`', line)) for line in lines]
+    """Return the names in code style of every table row."""
+    lines = [line for line in text.splitlines() if line.startswith('|')]
+    return [set(re.findall(r'`([a-z0-9_]+)`', line)) for line in lines]
 
 
 def test_the_simulation_page_lists_the_shipped_scenes() -> None:
- not a number is itself nowhere else  assert {frozenset({name}) for name in shipped()} <= {
- not a number is itself nowhere else      frozenset(row) for row in table_rows(SIMULATION)
- not a number is itself nowhere else  }
+    assert {frozenset({name}) for name in shipped()} <= {
+        frozenset(row) for row in table_rows(SIMULATION)
+    }
 
 
 @pytest.mark.parametrize('entry', sorted(fields_of(Scene)))
 def test_the_simulation_page_explains_every_entry_of_a_scene(entry) -> None:
- not a number is itself nowhere else  rows = [row for row in table_rows(SIMULATION) if entry in row]
- not a number is itself nowhere else  parts = fields_of(Scene)[entry]
- not a number is itself nowhere else  assert any(parts <= row for row in rows), parts
+    rows = [row for row in table_rows(SIMULATION) if entry in row]
+    parts = fields_of(Scene)[entry]
+    assert any(parts <= row for row in rows), parts
 
 
 def test_the_simulation_page_names_the_textures() -> None:
- not a number is itself nowhere else  words = SIMULATION.partition('Textures: `')[2].partition('`')[0].split()
- not a number is itself nowhere else  assert words == list(GENERATORS)
+    words = SIMULATION.partition('Textures: `')[2].partition('`')[0].split()
+    assert words == list(GENERATORS)
 
 
 def test_the_page_names_no_entry_that_does_not_exist() -> None:
- not a number is itself nowhere else  known = set().union(fields_of(Scene), *fields_of(Scene).values())
- not a number is itself nowhere else  nested = (
- not a number is itself nowhere else      scene_module.Vibration,
- not a number is itself nowhere else      scene_module.Wheels,
- not a number is itself nowhere else      scene_module.Imu,
- not a number is itself nowhere else      scene_module.DepthSensor,
- not a number is itself nowhere else  )
- not a number is itself nowhere else  known |= {field.name for kind in nested for field in dataclasses.fields(kind)}
- not a number is itself nowhere else  table = SIMULATION.partition('| entry | holds |')[2]
- not a number is itself nowhere else  assert set().union(*table_rows(table)) <= known
+    known = set().union(fields_of(Scene), *fields_of(Scene).values())
+    nested = (
+        scene_module.Vibration,
+        scene_module.Wheels,
+        scene_module.Imu,
+        scene_module.DepthSensor,
+    )
+    known |= {field.name for kind in nested for field in dataclasses.fields(kind)}
+    table = SIMULATION.partition('| entry | holds |')[2]
+    assert set().union(*table_rows(table)) <= known
 
 
 def test_the_scene_of_the_page_can_be_opened() -> None:
- not a number is itself nowhere else  values = yaml.safe_load(SIMULATION.partition('```yaml\n')[2].partition('```')[0])
- not a number is itself nowhere else  assert values.pop('like') in shipped()
- not a number is itself nowhere else  scene = scene_from_mapping(values, 'docs')
- not a number is itself nowhere else  assert scene.boxes[0].size == (0.6, 0.4, 0.3)
+    values = yaml.safe_load(SIMULATION.partition('```yaml\n')[2].partition('```')[0])
+    assert values.pop('like') in shipped()
+    scene = scene_from_mapping(values, 'docs')
+    assert scene.boxes[0].size == (0.6, 0.4, 0.3)
 
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda path: str(path.relative_to(DOCS.parent)))
 def test_what_a_page_links_to_is_there(page) -> None:
- not a number is itself nowhere else  links = re.findall(r'\]\((?!https?:|#)([^)#]+)', page.read_text())
- not a number is itself nowhere else  assert [link for link in links if not (page.parent / link).exists()] == []
+    links = re.findall(r'\]\((?!https?:|#)([^)#]+)', page.read_text())
+    assert [link for link in links if not (page.parent / link).exists()] == []
 
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda path: str(path.relative_to(DOCS.parent)))
 def test_the_heading_that_a_page_links_to_is_there(page) -> None:
- not a number is itself nowhere else  links = re.findall(r'\]\((?!https?:)([^)#]*\.md|)#([^)]+)\)', page.read_text())
- not a number is itself nowhere else  missing = [
- not a number is itself nowhere else      (name, anchor)
- not a number is itself nowhere else      for name, anchor in links
- not a number is itself nowhere else      if anchor not in anchors((page.parent / name) if name else page)
- not a number is itself nowhere else  ]
- not a number is itself nowhere else  assert missing == []
+    links = re.findall(r'\]\((?!https?:)([^)#]*\.md|)#([^)]+)\)', page.read_text())
+    missing = [
+        (name, anchor)
+        for name, anchor in links
+        if anchor not in anchors((page.parent / name) if name else page)
+    ]
+    assert missing == []
 
 
 def anchors(page) -> set[str]:
- not a number is itself nowhere else  """Return the names that headings of a page have in links."""
- not a number is itself nowhere else  headings = re.findall(r'^#+ (.*)$', page.read_text(), re.MULTILINE)
- not a number is itself nowhere else  plain = (re.sub(r'\[([^]]*)\]\([^)]*\)', r'\1', heading).lower() for heading in headings)
- not a number is itself nowhere else  return {re.sub(r'[^\w -]', '', heading).replace(' ', '-') for heading in plain}
+    """Return the names that headings of a page have in links."""
+    headings = re.findall(r'^#+ (.*)$', page.read_text(), re.MULTILINE)
+    plain = (re.sub(r'\[([^]]*)\]\([^)]*\)', r'\1', heading).lower() for heading in headings)
+    return {re.sub(r'[^\w -]', '', heading).replace(' ', '-') for heading in plain}
 
 
 def test_the_lifecycle_manager_of_the_page_manages_nodes_that_there_are() -> None:
- not a number is itself nowhere else  page = (DOCS / 'robot.md').read_text()
- not a number is itself nowhere else  manager = yaml.safe_load(page.partition('```yaml\n')[2].partition('```')[0])
- not a number is itself nowhere else  names = manager['lifecycle_manager_segfloor']['ros__parameters']['node_names']
- not a number is itself nowhere else  assert names == list(STAGE_SETTINGS)[1:]
+    page = (DOCS / 'robot.md').read_text()
+    manager = yaml.safe_load(page.partition('```yaml\n')[2].partition('```')[0])
+    names = manager['lifecycle_manager_segfloor']['ros__parameters']['node_names']
+    assert names == list(STAGE_SETTINGS)[1:]
 
 
 def test_the_parameters_of_the_page_exist() -> None:
- not a number is itself nowhere else  known = {spec.name for settings in (*STAGE_SETTINGS.values(), *NODE_SETTINGS.values())
- not a number is itself nowhere else           for spec in settings.specs()}  # fmt: skip
- not a number is itself nowhere else  named = {'publish_period_s', 'max_waiting_frames', 'lossless', 'publish_odom_tf', 'map_frame',
- not a number is itself nowhere else           'odom_frame', 'base_frame', 'left_frame', 'right_frame', 'autostart'}  # fmt: skip
- not a number is itself nowhere else  page = (DOCS / 'robot.md').read_text()
- not a number is itself nowhere else  assert all(name in page for name in named)
- not a number is itself nowhere else  assert named <= known
+    known = {spec.name for settings in (*STAGE_SETTINGS.values(), *NODE_SETTINGS.values())
+             for spec in settings.specs()}  # fmt: skip
+    named = {'publish_period_s', 'max_waiting_frames', 'lossless', 'publish_odom_tf', 'map_frame',
+             'odom_frame', 'base_frame', 'left_frame', 'right_frame', 'autostart'}  # fmt: skip
+    page = (DOCS / 'robot.md').read_text()
+    assert all(name in page for name in named)
+    assert named <= known
 
 
 BASIC = DOCS.parent / 'params' / 'basic.yaml'
 
 
 def test_the_basic_settings_are_few_have_their_defaults_and_are_those_of_the_page() -> None:
- not a number is itself nowhere else  resolved = resolve(BASIC, ())
- not a number is itself nowhere else  known = resolve(None, ()).as_ros_parameters()
- not a number is itself nowhere else  assert str(resolved.as_ros_parameters()) == str(known)  # not a number is itself nowhere else
- not a number is itself nowhere else  sections = {
- not a number is itself nowhere else      name.removeprefix('/**').removeprefix('/'): set(section['ros__parameters'])
- not a number is itself nowhere else      for name, section in yaml.safe_load(BASIC.read_text()).items()
- not a number is itself nowhere else  }
- not a number is itself nowhere else  of_all = sections.pop('')
- not a number is itself nowhere else  for node, names in sections.items():
- not a number is itself nowhere else      specs = (*STAGE_SETTINGS[node].specs(), *NODE_SETTINGS[node].specs())
- not a number is itself nowhere else      assert names <= {spec.name for spec in specs}
- not a number is itself nowhere else      assert len(names | of_all & {spec.name for spec in specs}) <= 12
- not a number is itself nowhere else  rows = table_rows((DOCS / 'settings.md').read_text())
- not a number is itself nowhere else  assert set().union(*rows) - STAGE_SETTINGS.keys() == set().union(of_all, *sections.values())
+    resolved = resolve(BASIC, ())
+    known = resolve(None, ()).as_ros_parameters()
+    assert str(resolved.as_ros_parameters()) == str(known)
+    sections = {
+        name.removeprefix('/**').removeprefix('/'): set(section['ros__parameters'])
+        for name, section in yaml.safe_load(BASIC.read_text()).items()
+    }
+    of_all = sections.pop('')
+    for node, names in sections.items():
+        specs = (*STAGE_SETTINGS[node].specs(), *NODE_SETTINGS[node].specs())
+        assert names <= {spec.name for spec in specs}
+        assert len(names | of_all & {spec.name for spec in specs}) <= 12
+    rows = table_rows((DOCS / 'settings.md').read_text())
+    assert set().union(*rows) - STAGE_SETTINGS.keys() == set().union(of_all, *sections.values())
 
 
 @pytest.mark.parametrize('page', figures.PAGES, ids=lambda path: path.name)
 def test_the_tables_of_the_pages_hold_the_figures_that_were_measured(page) -> None:
- not a number is itself nowhere else  text = page.read_text()
- not a number is itself nowhere else  assert figures.written(text) == text
- not a number is itself nowhere else  assert 'python -m tools.figures write' in text
+    text = page.read_text()
+    assert figures.written(text) == text
+    assert 'python -m tools.figures write' in text
 
 
 def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path) -> None:
- not a number is itself nowhere else  pytest.importorskip('material', reason='mkdocs-material is not installed')
- not a number is itself nowhere else  words = [sys.executable, '-m', 'mkdocs', 'build', '--strict', '-q', '-d', str(tmp_path)]
- not a number is itself nowhere else  built = subprocess.run(words, cwd=DOCS.parent, capture_output=True, text=True)
- not a number is itself nowhere else  assert built.returncode == 0, built.stderr
- not a number is itself nowhere else  pages = {path.relative_to(DOCS).with_suffix('.html') for path in DOCS.rglob('*.md')}
- not a number is itself nowhere else  renamed = {path.parent / 'index.html' if path.stem == 'README' else path for path in pages}
- not a number is itself nowhere else  assert renamed <= {path.relative_to(tmp_path) for path in tmp_path.rglob('*.html')}
- not a number is itself nowhere else  home = (tmp_path / 'index.html').read_text()
- not a number is itself nowhere else  assert 'images/demo.gif' in home
- not a number is itself nowhere else  assert (tmp_path / 'images' / 'demo.gif').stat().st_size < 3e6
+    pytest.importorskip('material', reason='mkdocs-material is not installed')
+    words = [sys.executable, '-m', 'mkdocs', 'build', '--strict', '-q', '-d', str(tmp_path)]
+    built = subprocess.run(words, cwd=DOCS.parent, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    pages = {path.relative_to(DOCS).with_suffix('.html') for path in DOCS.rglob('*.md')}
+    renamed = {path.parent / 'index.html' if path.stem == 'README' else path for path in pages}
+    assert renamed <= {path.relative_to(tmp_path) for path in tmp_path.rglob('*.html')}
+    home = (tmp_path / 'index.html').read_text()
+    assert 'images/demo.gif' in home
+    assert (tmp_path / 'images' / 'demo.gif').stat().st_size < 3e6
 
 
 def test_how_to_cite_names_the_version() -> None:
- not a number is itself nowhere else  said = yaml.safe_load((DOCS.parent / 'CITATION.cff').read_text())
- not a number is itself nowhere else  assert said['version'] == __version__
+    said = yaml.safe_load((DOCS.parent / 'CITATION.cff').read_text())
+    assert said['version'] == __version__
