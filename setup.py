@@ -51,10 +51,9 @@ setup(
     long_description_content_type='text/markdown',
     license='Apache-2.0',
     maintainer='segfloor_ros maintainers',
-    url=os.environ.get('REPOSITORY_URL', ''),  # set by the workflow that publishes
+    url=os.environ.get('REPOSITORY_URL'),  # set by the workflow that publishes
     classifiers=[
         'Intended Audience :: Science/Research',
-        'License :: OSI Approved :: Apache Software License',
         'Operating System :: POSIX :: Linux',
         'Programming Language :: Python :: 3',
         'Topic :: Scientific/Engineering',

@@ -154,7 +154,7 @@ def finish_run(
     has_map = (folder.path / MAP).is_file()
     place = f'map: {folder.path / MAP}' if has_map else f'path: {folder.path / "trajectory.txt"}'
     console.print(place, soft_wrap=True)
-    problems = list(folder.problems)
+    problems, page = list(folder.problems), None
     if report:
         # Imported here: Matplotlib takes a second that other commands should not wait for.
         from segfloor_ros.apps.evaluation.report import write_report
@@ -162,14 +162,15 @@ def finish_run(
         recording = Path(input_name)
         truth = recording if (recording / 'map.yaml').is_file() else None
         try:
-            written = write_report(folder.path, truth)
-            console.print(f'report: {written}', soft_wrap=True)
+            page = str(write_report(folder.path, truth))
+            console.print(f'report: {page}', soft_wrap=True)
         except Exception as error:  # whatever it is, the results are there
             problems.append(f'there is no report: {str(error) or type(error).__name__}')
     for line in (*problems, *remarks):
         print_error(line)
     if figures is not None:
-        print_json({**dataclasses.asdict(figures), 'out': str(folder.path)})
+        places = {'out': str(folder.path), 'report': page}
+        print_json(dataclasses.asdict(figures) | places)
     if status and not problems:
         kept = f'; the whole result in {out} stays' if folder.path != out else ''
         print_error(f'cut short: what is mapped is in {folder.path}{kept}')

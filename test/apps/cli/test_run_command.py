@@ -435,6 +435,7 @@ def test_the_figures_of_a_run_are_printed_as_json_alone(recording, tmp_path):
     assert done.returncode == 0, done.stderr
     printed = json.loads(done.stdout)
     assert printed.pop('out') == str(tmp_path / 'out')
+    assert printed.pop('report') is None
     assert printed == json.loads((tmp_path / 'out' / 'summary.json').read_text())
 
 
