@@ -188,9 +188,9 @@ def advice(data: ReportData) -> list[str]:
 def _doubts(summary: Mapping[str, Any]) -> list[str]:
     """Return why the map may not be that of the whole drive, or not of the floor, each in a line.
 
-    A robot sways: the median of N heights above the planes of keyframes has the standard deviation
-    1.25 `SWAY` / sqrt(N), as that of N normal values. What differs by more than three of these does
-    not come from swaying.
+    A robot sways, and floor segmentation expects each frame within `SWAY` of the mount. So much may
+    the median of the heights above the planes of N keyframes differ, too, and where they are few by
+    three of its standard deviations, 1.25 `SWAY` / sqrt(N) for normal values.
     """
     lines = []
     tracked, frames = summary['tracked_frames'], summary['frames']
@@ -210,13 +210,14 @@ def _doubts(summary: Mapping[str, Any]) -> list[str]:
             f'{floor["planes"]} of {summary["keyframes"]} keyframes show the plane of the floor: '
             'too few to check the height of the camera',
         ]
-    sigma_m = 1.25 * SWAY[2] * height_m / math.sqrt(floor['planes'])
-    if abs(floor['median_m'] - height_m) > SURE * sigma_m:
+    sway_m, sigmas = SWAY[2] * height_m, SURE * 1.25 / math.sqrt(floor['planes'])
+    if abs(floor['median_m'] - height_m) > sway_m * max(1, sigmas):
         lines.append(
             f'the mount says that the camera is {height_m:.3f} m above the floor, single keyframes '
             f'show {floor["median_m"]:.3f} m: measure it, and give stereo_slam.camera_height_m'
         )
-    if abs(floor['last_m'] - floor['first_m']) > SURE * math.sqrt(2 * 3) * sigma_m:
+    of_thirds = math.sqrt(2 * 3) * sigmas  # the difference of two medians of N / 3
+    if abs(floor['last_m'] - floor['first_m']) > sway_m * max(1, of_thirds):
         lines.append(
             f'the height of the camera above the floor changes from {floor["first_m"]:.3f} to '
             f'{floor["last_m"]:.3f} m along the drive: is it fixed to the robot?'
