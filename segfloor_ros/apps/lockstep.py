@@ -436,6 +436,8 @@ class LockstepRun:
         of_floor = [self._said.get(about, words) for about, words in stages.floor.remarks.items()]
         faults = slam.rig_check.faults
         faults.update({name: self._faults_said.get(name, one) for name, one in faults.items()})
+        planes = stages.floor.fixture.planes
+        floor = results_folder.floor_heights(planes[:, 2]) if has_map else None
         return results_folder.summarise(
             [results_folder.DriveFrame.of(result) for result in self._results],
             wall_s,
@@ -450,6 +452,7 @@ class LockstepRun:
             input_faults=slam.rig_check.as_dicts(),
             failed_frames=self._failed_frames,
             failed_keyframes=pipeline.failed_keyframes,
+            floor=floor,
             interrupted=self._is_cut_short,
             stages=pipeline.times.summary(),
             rss_mb=self._memory.summary(),

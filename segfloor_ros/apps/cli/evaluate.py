@@ -83,7 +83,7 @@ def evaluate_map(
     repetitions: Annotated[int, number_option('Road maps to average.', 1)] = 30,
     seed: Annotated[int, number_option('Of the random nodes.', 0)] = 0,
     sight: Annotated[
-        float, number_option('How far the camera is said to see, in m.', 0.1, 1000.0)
+        float, number_option('Range of the camera, in m.', 0.1, 1000.0)
     ] = DEFAULT_RANGE_M,
     fov: Annotated[
         float | None,

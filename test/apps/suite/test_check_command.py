@@ -104,6 +104,17 @@ def test_what_became_worse_than_the_baseline_is_named(room, tmp_path):
     assert '(baseline ' in second.stderr
 
 
+def test_what_a_check_has_found_is_printed_as_json_alone(tmp_path):
+    text = 'recordings: [{{input: {empty}, name: empty, expect: {{tracked_percent: 100}}}}]'
+    done = check(suite_of(tmp_path, tmp_path, text), '--out', tmp_path / 'out', '--json')
+    assert done.returncode == 1
+    found = json.loads(done.stdout)
+    (recording,) = found.pop('recordings')
+    assert found == {'name': 'suite', 'holds': False}
+    assert (recording['name'], recording['state']) == ('empty', 'no map')
+    assert recording['wrong'][0].startswith('empty: ')
+
+
 def test_a_bad_suite_ends_with_status_2(room, tmp_path):
     path = suite_of(tmp_path, room, good_alone() + '    colour: red\n')
     done = check(path, '--out', tmp_path / 'out')

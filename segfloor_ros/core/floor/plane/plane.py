@@ -169,6 +169,11 @@ class Fixture:
         self.problem: str | None = None
         self._planes: list[Array] = []
 
+    @property
+    def planes(self) -> Array:
+        """Pitch, roll and height (N, 3) of the camera above the planes of frames, in order."""
+        return np.reshape(self._planes, (-1, 3))
+
     def usual(self, mounted: Array) -> Array:
         """Return pitch, roll and height (1, 3) of the camera in most frames, where that is not how
         it is mounted (3,); (0, 3) where it is, and while few frames were seen.
