@@ -113,7 +113,6 @@ def features(seen: Seen, weight: Picture) -> Picture:
     `known_weight`.
     """
     known = (seen.disparity_px > 0).astype(np.float32)
-    one = np.ones_like(known)
     height, mostly_on = _local_height(seen, weight, known)
     rises = _rise(seen, weight, known)
     # What is as level as a floor is none where it is higher, and what stands on it is higher.
@@ -121,7 +120,7 @@ def features(seen: Seen, weight: Picture) -> Picture:
     rises *= np.where(rises > 0, np.exp(-(height**2) / 8), is_higher)
     positive = (np.maximum(values, 0) for values in (height, rises, -rises, mostly_on))
     look = _look(seen.grey, seen.is_floor)
-    return np.stack([one, *positive, seen.better * known, look])
+    return np.stack([np.ones_like(known), *positive, seen.better * known, look])
 
 
 def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, float]) -> np.float32:
@@ -195,8 +194,7 @@ class Likelihood:
     where none are given."""
 
     def __init__(self, weights: Sequence[float] | Array | None = None) -> None:
-        chosen = list(WEIGHTS.values()) if weights is None else weights
-        self.weights = np.array(chosen, np.float32)
+        self.weights = np.array(list(WEIGHTS.values()) if weights is None else weights, np.float32)
 
     def weighed(self, mask: NDArray[np.uint8], seen: Seen) -> NDArray[np.uint8]:
         """Return a mask (R, W) without floor that is not likely, and with what surely is floor,

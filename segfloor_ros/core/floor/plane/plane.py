@@ -413,6 +413,21 @@ class FramePrior:
         self.sigmas[:, 2] *= self.means[:, 2]
         self._most = SURE if is_fixed else math.inf
 
+    def log_posterior(self, samples: Samples, angles_height: Array) -> Array:
+        """Return the logarithms of the likelihood times the density (M,) of planes (M, 3).
+
+        A fixed camera that is as it is mounted knows its plane: what lies below that, farther than
+        what lies on it on average, is a drop and no contradiction.
+        """
+        likelihood = np.repeat(scores(samples, angles_height)[:, None], len(self.means), axis=1)
+        if self._most < math.inf:
+            error, limit, _ = (part[:, 0] for part in _seen(samples, plane_of(self.means[:1])))
+            floor_px, on = samples.disparity_px - error, np.abs(error) < SAME_PX
+            mean_px = floor_px[on].sum() / max(np.count_nonzero(on), 1)
+            kept = samples.take(np.flatnonzero((error >= limit) | (floor_px > mean_px)))
+            likelihood[:, 0] = scores(kept, angles_height)
+        return np.asarray((_NATS * likelihood + self.log_density(angles_height)).max(axis=1))
+
     def log_density(self, angles_height: Array) -> Array:
         """Return the logarithms of the density of each component (M, P + 1) at planes (M, 3)."""
         off = (angles_height[:, None] - self.means) / self.sigmas
@@ -435,11 +450,9 @@ def _likeliest(samples: Samples, prior: FramePrior) -> Array:
     raised[:, 2] = 1.0
     depth_m = samples.disparity_m / samples.disparity_px[on]
     raised[:, 2] = -depth_m * (plane_of(raised) * samples.rays[on]).sum(axis=1)
-    guesses = np.vstack([prior.means, drawn])
+    guesses, few = np.vstack([prior.means, drawn]), samples.every(int(_CORRELATED_SAMPLES))
     guesses = guesses[plausible(guesses)]
-    likelihood = _NATS * scores(samples.every(int(_CORRELATED_SAMPLES)), guesses)
-    best: Array = guesses[np.argmax(likelihood + prior.log_density(guesses).max(axis=1))]
-    return best
+    return np.asarray(guesses[np.argmax(prior.log_posterior(few, guesses))])
 
 
 def _refined(samples: Samples, guess: Array, prior: FramePrior) -> PlaneFit:
@@ -450,7 +463,6 @@ def _refined(samples: Samples, guess: Array, prior: FramePrior) -> PlaneFit:
     expected = prior.means[nearest], prior.sigmas[nearest]
     unknown, still = np.full(3, np.nan), np.zeros((0, 3))
     fit = refine(samples, guess, unknown, still, *expected, NEAR_SCALES_PX)
-    plane = fit.angles_height[None]
-    evidence = _NATS * scores(samples, plane)[0] + prior.log_density(plane).max()
+    evidence = prior.log_posterior(samples, fit.angles_height[None])[0]
     evidence += np.log(fit.sigma).sum() + 1.5 * math.log(2 * math.pi)
     return replace(fit, evidence=float(evidence))

@@ -53,7 +53,8 @@ def driven(frames, wheels):
 
 @pytest.fixture(scope='module')
 def on_wheels(frames):
-    return driven(frames, [base_at(k / 5) for k in range(5 * FRAMES + 5)])
+    poses = [base_at(k / 5) for k in range(5 * FRAMES + 5)]
+    return driven(frames, [make_transform(T[:3, :3], 1.02 * T[:3, 3]) for T in poses])
 
 
 @pytest.fixture(scope='module')
