@@ -2,7 +2,8 @@
 
 `python -m tools.figures measure DATA WORK` renders the drives, maps all of them and the recordings
 in DATA, and writes docs/figures.json; what is there already is used again. `python -m tools.figures
-write` puts its figures between the marks of the two pages.
+write` puts its figures, and those of docs/published.json (`tools.benchmark_published`), between the
+marks of the two pages.
 """
 
 from __future__ import annotations
@@ -32,9 +33,11 @@ from segfloor_ros.apps.suite.measures import measure_run, start_pose_of
 from segfloor_ros.apps.trajectory import read_trajectory
 from segfloor_ros.core.files.whole import read_json
 from segfloor_ros.core.geometry import Array
+from tools.published_figures import Row, page_table
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / 'docs' / 'figures.json'
+PUBLISHED_FIGURES = ROOT / 'docs' / 'published.json'
 PAGES = (ROOT / 'README.md', ROOT / 'docs' / 'benchmarks.md')
 OUTLINES = ROOT / 'test' / 'core' / 'floor'
 TIMEOUT_S = 3600.0
@@ -126,7 +129,8 @@ def write() -> None:
 def written(page: str) -> str:
     """Return a page with the tables that its marks ask for."""
     figures = read_json(FIGURES, 'figures')
-    for mark, table in {'measured': _short_table, 'drives': _long_table}.items():
+    tables = {'measured': _short_table, 'drives': _long_table, 'published': _published_table}
+    for mark, table in tables.items():
         start, end = f'<!-- {mark}: python -m tools.figures write -->\n', f'<!-- end of {mark} -->'
         if start in page:
             before, _, rest = page.partition(start)
@@ -232,6 +236,13 @@ def _long_table(figures: dict[str, Any]) -> str:
             )
         )  # fmt: skip
     return _table(heads, rows)
+
+
+def _published_table(figures: dict[str, Any]) -> str:
+    """Return the figures of docs/published.json; the others are not needed."""
+    found = read_json(PUBLISHED_FIGURES, 'figures')
+    rows = [Row(**row) for row in found['rows']]
+    return f'{page_table(rows)}\nMeasured here: {found["about"]}.\n'
 
 
 def _tracked(found: dict[str, float]) -> str:
