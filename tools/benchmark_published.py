@@ -2,7 +2,9 @@
 figures: `python -m tools.benchmark_published`.
 
 Each is mapped by default, and as published: by the same drive. `--rtabmap rtabgrid` also runs a
-runner of RTAB-Map over it, `rtabgrid slam DIR --out PATH.txt` and `rtabgrid grid DIR --out MAP …`.
+runner of RTAB-Map over it, `rtabgrid slam DIR --out PATH.txt` and `rtabgrid grid DIR --out MAP …`. The drives of the second
+published work are compared by their paths (`published_paths`).
+
 `--keep` writes docs/published.json, from which `python -m tools.figures write` makes the table of
 docs/benchmarks.md.
 """
@@ -55,6 +57,7 @@ from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, OccupancyGrid, Occu
 from segfloor_ros.nodes.configuration import resolve
 from segfloor_ros.nodes.map_files import save_map
 from segfloor_ros.nodes.yaml_files import read_yaml
+from tools import published_paths
 from tools.benchmark_stages import (
     JSON_VERSION,
     MeasuredStages,
@@ -77,7 +80,9 @@ from tools.published_figures import (
     cells_of,
     parse_scenes,
 )
+from tools.published_paths import PathRow
 
+SCENES = (*PUBLISHED, *published_paths.DRIVES)
 KEPT = Path(__file__).resolve().parents[1] / 'docs' / 'published.json'
 
 DEFAULT, AS_PUBLISHED = 'segfloor_ros', 'segfloor_ros, as published'
@@ -313,7 +318,9 @@ def _figure(said: str, name: str) -> float:
     return float(found[1])
 
 
-def as_document(results: Sequence[SceneResult], rows: Sequence[Row]) -> dict[str, Any]:
+def as_document(
+    results: Sequence[SceneResult], rows: Sequence[Row], paths: Sequence[PathRow] = ()
+) -> dict[str, Any]:
     """Return the figures of all scenes as plain numbers for a JSON file."""
     return {
         'version': JSON_VERSION,
@@ -325,25 +332,29 @@ def as_document(results: Sequence[SceneResult], rows: Sequence[Row]) -> dict[str
         'published': [
             dataclasses.asdict(row) for scene in PUBLISHED.values() for row in scene.rows
         ],
+        'paths': [dataclasses.asdict(row) for row in paths],
         'workloads': [dataclasses.asdict(result.workload) for result in results],
     }
 
 
-def keep(rows: Sequence[Row], about: str) -> None:
+def keep(rows: Sequence[Row], paths: Sequence[PathRow], about: str) -> None:
     """Put rows into docs/published.json, in place of those of the same scenes and systems. about:
     where and when they were measured.
     """
-    kept = [Row(**row) for row in read_json(KEPT, 'figures')['rows']] if KEPT.is_file() else []
-    new = {(row.scene, row.system): row for row in (*kept, *map(_rounded, rows))}
-    document = {'about': about, 'rows': [dataclasses.asdict(row) for row in new.values()]}
+    kept = read_json(KEPT, 'figures') if KEPT.is_file() else {'rows': [], 'paths': []}
+    document: dict[str, Any] = {'about': about}
+    for kind, keys, new in (
+        ('rows', ('scene', 'system'), rows),
+        ('paths', ('drive', 'system'), paths),
+    ):
+        found = [*kept[kind], *map(_rounded, new)]
+        document[kind] = [*{tuple(one[key] for key in keys): one for one in found}.values()]
     KEPT.write_text(json.dumps(document, indent=1) + '\n', encoding='utf-8')
 
 
-def _rounded(row: Row) -> Row:
+def _rounded(row: Row | PathRow) -> dict[str, Any]:
     values: dict[str, Any] = dataclasses.asdict(row)
-    for name, value in values.items():
-        values[name] = round(value, 4) if isinstance(value, float) else value
-    return Row(**values)
+    return {k: round(v, 4) if isinstance(v, float) else v for k, v in values.items()}
 
 
 def published_table(rows: Sequence[Row]) -> Table:
@@ -362,10 +373,19 @@ def published_table(rows: Sequence[Row]) -> Table:
     return table
 
 
+def path_table(rows: Sequence[PathRow]) -> Table:
+    """Return the paths measured here above the published ones."""
+    table = figure_table(*published_paths.HEADS)
+    for row in published_paths.all_rows(rows):
+        table.add_row(*published_paths.words_of(row))
+    table.caption = f'published: {published_paths.SOURCE}; see tools/published_paths.py'
+    return table
+
+
 def benchmark_published(
-    scenes: Annotated[str, typer.Option(help='Which of the published scenes.')] = ','.join(
-        PUBLISHED
-    ),
+    scenes: Annotated[
+        str, typer.Option(help='Which of the published scenes and drives.')
+    ] = ','.join(SCENES),
     workdir: Annotated[
         Optional[Path],  # noqa: UP045  typer evaluates it, also on Python 3.10
         typer.Option(help='Keep renderings, maps and overlays here; what is there is used again.'),
@@ -385,11 +405,13 @@ def benchmark_published(
     assignments: options.Set = None,
 ) -> None:
     """Simulate, map and score the scenes of the published evaluation."""
-    names, rows = parse_scenes(scenes), []
+    names, rows, paths = parse_scenes(scenes, SCENES), [], []
     results: list[SceneResult] = []
     with tempfile.TemporaryDirectory(prefix='segfloor-') as temporary, announcing() as announce:
         base = workdir or Path(temporary)
-        for name in names:
+        for name in (name for name in names if name in published_paths.DRIVES):
+            paths += published_paths.run_drive(name, base / name, announce)
+        for name in (name for name in names if name in PUBLISHED):
             scene, folder = published_scene(name), base / name
             for system, own in MODES.items():
                 given = [*own, *(assignments or ())]
@@ -401,17 +423,20 @@ def benchmark_published(
                 rows.append(result.row)
             if rtabmap is not None:
                 rows += run_rtabmap(rtabmap, name, folder, announce)
-    console.print(stage_table([result.workload for result in results]))
-    console.print(workload_table([result.workload for result in results]))
-    console.print(published_table(rows))
+    if rows:
+        console.print(stage_table([result.workload for result in results]))
+        console.print(workload_table([result.workload for result in results]))
+        console.print(published_table(rows))
+    if paths:
+        console.print(path_table(paths))
     if workdir is not None:
         console.print(f'maps on the truth: {workdir}/*/*_overlay.png', highlight=False)
     if is_kept:
         here = machine()
         today = datetime.date.today().isoformat()
-        keep(rows, f'{today}, {here["processor"]}, Python {here["python"]}')
+        keep(rows, paths, f'{today}, {here["processor"]}, Python {here["python"]}')
     if as_json:
-        options.print_json(as_document(results, rows))
+        options.print_json(as_document(results, rows, paths))
 
 
 if __name__ == '__main__':

@@ -34,6 +34,7 @@ from segfloor_ros.apps.trajectory import read_trajectory
 from segfloor_ros.core.files.whole import read_json
 from segfloor_ros.core.geometry import Array
 from tools.published_figures import Row, page_table
+from tools.published_paths import PathRow, paths_table
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / 'docs' / 'figures.json'
@@ -129,7 +130,12 @@ def write() -> None:
 def written(page: str) -> str:
     """Return a page with the tables that its marks ask for."""
     figures = read_json(FIGURES, 'figures')
-    tables = {'measured': _short_table, 'drives': _long_table, 'published': _published_table}
+    tables = {
+        'measured': _short_table,
+        'drives': _long_table,
+        'published': _published_table,
+        'paths': _paths_table,
+    }
     for mark, table in tables.items():
         start, end = f'<!-- {mark}: python -m tools.figures write -->\n', f'<!-- end of {mark} -->'
         if start in page:
@@ -243,6 +249,12 @@ def _published_table(figures: dict[str, Any]) -> str:
     found = read_json(PUBLISHED_FIGURES, 'figures')
     rows = [Row(**row) for row in found['rows']]
     return f'{page_table(rows)}\nMeasured here: {found["about"]}.\n'
+
+
+def _paths_table(figures: dict[str, Any]) -> str:
+    """Return the paths of docs/published.json; the other figures are not needed."""
+    found = read_json(PUBLISHED_FIGURES, 'figures')
+    return paths_table([PathRow(**row) for row in found['paths']])
 
 
 def _tracked(found: dict[str, float]) -> str:

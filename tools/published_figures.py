@@ -79,7 +79,7 @@ PUBLISHED: dict[str, PublishedScene] = {
             (3.5, 1.0), (3.65, 0.2), (4.3, 0.3), (4.8, -0.1), (4.0, 0.0), (3.0, -0.4), (1.9, -0.1),
             (0.8, 0.2), (0.2, 0.1),
         ),
-        speed_m_s=0.2,
+        speed_m_s=0.3,
     ),
     'corridor2': PublishedScene(
         20,
@@ -133,14 +133,12 @@ cannot be read in the scan. RTAB-Map's memory is said to grow 71.62 times as fas
 """
 
 
-def parse_scenes(text: str) -> list[str]:
-    """Return the names in `corridor1,corridor2`. Raises SettingsError for an unknown one."""
+def parse_scenes(text: str, known: Sequence[str]) -> list[str]:
+    """Return the names in `corridor1,corridor2`. Raises SettingsError for one that is not known."""
     names = [part.strip() for part in text.split(',')]
     for name in names:
-        if name not in PUBLISHED:
-            raise SettingsError(
-                f'--scenes: no published scene {name}{suggestion(name, [*PUBLISHED])}'
-            )
+        if name not in known:
+            raise SettingsError(f'--scenes: no published scene {name}{suggestion(name, [*known])}')
     return names
 
 

@@ -11,15 +11,16 @@ import pytest
 from rich.console import Console
 
 from segfloor_ros.apps.map_files import load_map
-from segfloor_ros.apps.simulation.scene_file import shipped
+from segfloor_ros.apps.simulation.scene_file import open_scene, shipped
 from segfloor_ros.apps.simulation.world import RenderingError
 from segfloor_ros.core.errors import SegfloorError, SettingsError
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from segfloor_ros.nodes.configuration import resolve
-from tools import benchmark_published
+from tools import benchmark_published, published_paths
 from tools.benchmark_published import (
     AS_PUBLISHED,
     MODES,
+    SCENES,
     as_document,
     keep,
     published_scene,
@@ -29,17 +30,18 @@ from tools.benchmark_published import (
     without_specks,
 )
 from tools.published_figures import HEADS, PUBLISHED, Row, page_table, parse_scenes
+from tools.published_paths import DRIVES, PathRow, paths_table
 
 CONFIGURATION = resolve()
 
 
 def test_an_unknown_scene_is_refused():
     with pytest.raises(SettingsError, match='did you mean corridor2'):
-        parse_scenes('corridor1,coridor2')
+        parse_scenes('corridor1,coridor2', SCENES)
 
 
 def test_the_published_scenes_are_shipped_and_their_rows_name_a_page():
-    assert set(PUBLISHED) <= set(shipped())
+    assert set(SCENES) == {*PUBLISHED, *DRIVES} <= set(shipped())
     for name, scene in PUBLISHED.items():
         assert all(row.scene == name and 'p. ' in row.source for row in scene.rows)
         assert published_scene(name).camera.rate_hz == 15.0
@@ -64,8 +66,12 @@ def test_only_specks_within_free_floor_are_removed():
 
 def test_rows_are_kept_by_scene_and_system(tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark_published, 'KEPT', tmp_path / 'published.json')
-    keep([Row('corridor1', 'a', precision_percent=1.23456), Row('corridor2', 'a')], 'once')
-    keep([Row('corridor1', 'a', precision_percent=99.0), Row('corridor1', 'b')], 'again')
+    keep([Row('corridor1', 'a', precision_percent=1.23456), Row('corridor2', 'a')], [], 'once')
+    keep(
+        [Row('corridor1', 'a', precision_percent=99.0), Row('corridor1', 'b')],
+        [PathRow('town', 'b', length_m=2.0)],
+        'again',
+    )
     document = json.loads((tmp_path / 'published.json').read_text())
     assert document['about'] == 'again'
     rows = [Row(**row) for row in document['rows']]
@@ -73,6 +79,9 @@ def test_rows_are_kept_by_scene_and_system(tmp_path, monkeypatch):
         ('corridor1', 'a'), ('corridor2', 'a'), ('corridor1', 'b')
     ]  # fmt: skip
     assert rows[0].precision_percent == 99.0
+    paths = paths_table([PathRow(**row) for row in document['paths']])
+    assert '| town | b | 2.00 m |' in paths
+    assert '| Husky 01, S | ORB-SLAM3 | 56.81 m | 53.54 m |' in paths
     page = page_table(rows)
     lines = [line.strip('| ').split(' | ') for line in page.splitlines()]
     assert lines[2][0] == 'corridor1: a' and '99.0 %' in page
@@ -185,3 +194,26 @@ def test_a_scene_is_rendered_once_mapped_and_scored(tmp_path):
     document = json.loads(json.dumps(as_document([first], [first.row])))
     assert document['rows'][0]['scene'] == 'corridor2'
     assert document['published'][0]['system'] == 'Segfloor'
+
+
+@pytest.mark.slow
+def test_a_drive_is_mapped_with_and_without_what_moves(tmp_path, monkeypatch):
+    """A short part of it; the whole is measured with the figures."""
+
+    def short(name):
+        small = ('camera.width=320', 'camera.height=240', 'path.waypoints=[[0, -2], [0.8, -2]]')
+        return open_scene(name, small)
+
+    monkeypatch.setattr(published_paths, 'open_scene', short)
+    try:
+        rows = run_drive('house', tmp_path, lambda what, total: lambda done: None)
+    except RenderingError as error:
+        pytest.skip(str(error))
+    assert [row.system for row in rows] == list(published_paths.MODES)
+    for row in rows:
+        assert row.drive == 'house'
+        assert row.true_length_m == pytest.approx(0.8, abs=0.05)
+        assert row.length_m == pytest.approx(row.true_length_m, rel=0.05)
+        assert 0 < row.frame_s < 5
+    settings = [(tmp_path / f'run{k}' / 'settings.yaml').read_text() for k in (0, 1)]
+    assert ['detect_moving: true' in text for text in settings] == [True, False]
