@@ -2,8 +2,8 @@
 figures: `python -m tools.benchmark_published`.
 
 Each is mapped by default, and as published: by the same drive. `--rtabmap rtabgrid` also runs a
-runner of RTAB-Map over it, `rtabgrid slam DIR --out PATH.txt` and `rtabgrid grid DIR --out MAP …`. The drives of the second
-published work are compared by their paths (`published_paths`).
+runner of RTAB-Map over it, `rtabgrid slam DIR --out PATH.txt` and `rtabgrid grid DIR --out MAP …`.
+The drives of the second published work are compared by their paths (`published_paths`).
 
 `--keep` writes docs/published.json, from which `python -m tools.figures write` makes the table of
 docs/benchmarks.md.

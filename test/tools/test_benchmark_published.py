@@ -30,7 +30,7 @@ from tools.benchmark_published import (
     without_specks,
 )
 from tools.published_figures import HEADS, PUBLISHED, Row, page_table, parse_scenes
-from tools.published_paths import DRIVES, PathRow, paths_table
+from tools.published_paths import DRIVES, PathRow, paths_table, run_drive
 
 CONFIGURATION = resolve()
 
