@@ -92,7 +92,7 @@ MODES: dict[str, tuple[str, ...]] = {
         'occupancy_grid.as_published=true',
         'cloud_labelling.robot_height_m=10',
         'stereo_slam.keyframe_novelty=0.3',
-        'stereo_slam.num_features=2000',
+        'stereo_slam.num_features=3000',
     ),
 }
 """Assignments by name. As published: points alone, no height limit, a keyframe wherever the
