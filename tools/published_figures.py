@@ -12,7 +12,7 @@ from segfloor_ros.core.settings import suggestion
 
 SOURCE = 'Segfloor dissertation (2022, in Portuguese), chapter 7'
 SEGFLOOR, RAYS, NO_RAYS = 'Segfloor', 'RTAB-Map, ray tracing', 'RTAB-Map, no ray tracing'
-TABLES = '§7.4, tables 3 to 5, p. 108 and 109'
+TABLES = '§7.4, p. 108, 109'
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,11 @@ PUBLISHED: dict[str, PublishedScene] = {
         20,
         10.0,
         (
-            Row('corridor1', SEGFLOOR, TABLES, 0.01, 354, 99.48, None, 97.70),
-            Row('corridor1', SEGFLOOR, '§7.2, p. 101', 0.01, update_max_s=0.39),
-            Row('corridor1', RAYS, TABLES, 0.05, None, 96.63, None, 94.94),
+            Row('corridor1', SEGFLOOR, f'{TABLES}; §7.2, p. 101', 0.01, 354, 99.48, None, 97.70,
+                update_max_s=0.39),
+            Row('corridor1', RAYS, f'{TABLES}; §7.2, p. 102', 0.05, None, 96.63, None, 94.94,
+                update_max_s=1.23),
             Row('corridor1', NO_RAYS, TABLES, 0.05, None, 99.66, None, 59.06),
-            Row('corridor1', 'RTAB-Map', '§7.2, p. 102', 0.05, update_max_s=1.23),
         ),
         range_m=2.0,
         waypoints=(
@@ -86,11 +86,11 @@ PUBLISHED: dict[str, PublishedScene] = {
         20,
         7.9,
         (
-            Row('corridor2', SEGFLOOR, TABLES, 0.01, 220, 99.64, None, 97.23),
-            Row('corridor2', SEGFLOOR, '§7.2, p. 101', 0.01, update_max_s=0.38),
-            Row('corridor2', RAYS, TABLES, 0.05, None, 99.22, None, 96.21),
+            Row('corridor2', SEGFLOOR, f'{TABLES}; §7.2, p. 101', 0.01, 220, 99.64, None, 97.23,
+                update_max_s=0.38),
+            Row('corridor2', RAYS, f'{TABLES}; §7.2, p. 102', 0.05, None, 99.22, None, 96.21,
+                update_max_s=2.70),
             Row('corridor2', NO_RAYS, TABLES, 0.05, None, 99.31, None, 71.73),
-            Row('corridor2', 'RTAB-Map', '§7.2, p. 102', 0.05, update_max_s=2.70),
         ),
         range_m=2.0,
         waypoints=(
@@ -116,21 +116,19 @@ PUBLISHED: dict[str, PublishedScene] = {
         100,
         682.7,
         (
-            Row('large_loop', SEGFLOOR, TABLES, None, 1007, 99.41, None, 98.52),
-            Row('large_loop', SEGFLOOR, '§7.3.1, p. 104', update_s=0.19, update_mb=0.073),
-            Row('large_loop', RAYS, TABLES, None, None, 98.44, None, 31.67),
-            Row(
-                'large_loop', RAYS, '§7.3.1, p. 104',
-                update_s=0.47, update_max_s=0.96, update_mb=5.2,
-            ),
+            Row('large_loop', SEGFLOOR, f'{TABLES}; §7.3.1, p. 104', None, 1007, 99.41, None, 98.52,
+                0.19, update_mb=0.073),
+            Row('large_loop', RAYS, f'{TABLES}; §7.3.1, p. 104', None, None, 98.44, None, 31.67,
+                0.47, 0.96, 5.2),
         ),
         0.05,
         range_m=5.0,
     ),
 }  # fmt: skip
 """By name of the shipped scene that follows the original. Of the complex room only times were
-published. Times and memory per update are of the synthetic scene alone; its longest Segfloor update
-cannot be read in the scan. RTAB-Map's memory is said to grow 71.62 times as fast.
+published, and of RTAB-Map's longest update in the corridors not with which rays. Times and memory
+per update are of the synthetic scene alone; its longest Segfloor update cannot be read in the scan.
+RTAB-Map's memory is said to grow 71.62 times as fast.
 """
 
 
@@ -144,43 +142,53 @@ def parse_scenes(text: str, known: Sequence[str]) -> list[str]:
 
 
 HEADS = (
-    'scene, system', 'cell', 'keyframes', 'precision', 'recall, floor in view', 'recall, all floor',
-    'update: mean, longest', 'MB per update', 'path error', 'CPU', 'memory', 'source',
+    'scene: system', 'cell, keyframes', 'precision', 'recall: in view / all',
+    'update: mean / longest, growth', 'path error, CPU, memory', 'source',
 )  # fmt: skip
 
 
 def cells_of(row: Row) -> tuple[str, ...]:
     """Return a row in words, one cell for each of `HEADS` but the first."""
-    both = (row.update_s, row.update_max_s)
-    update = ' / '.join(_text(value, '{:.2f} s') for value in both)
-    return (
-        _text(row.cell_m and 100 * row.cell_m, '{:g} cm'),
-        _text(row.keyframes, '{:d}'),
-        *(
-            _text(value, '{:.1f} %')
-            for value in (row.precision_percent, row.recall_seen_percent, row.recall_all_percent)
-        ),
-        '' if both == (None, None) else update,
-        _text(row.update_mb, '{:.3f}'),
-        _text(row.path_error_m, '{:.3f} m'),
+    costs = (
+        _text(row.path_error_m and 1000 * row.path_error_m, '{:.1f} mm'),
         _text(row.cpu_s, '{:.0f} s'),
         _text(row.peak_mb, '{:.0f} MB'),
+    )
+    update = _pair(row.update_s, row.update_max_s, '{:.2f}', ' s')
+    return (
+        _joined(_text(row.cell_m and 100 * row.cell_m, '{:g} cm'), _text(row.keyframes, '{:d}')),
+        _text(row.precision_percent, '{:.1f} %'),
+        _pair(row.recall_seen_percent, row.recall_all_percent, '{:.1f}', ' %'),
+        _joined(update, _text(row.update_mb, '{:.2g} MB')),
+        _joined(*costs),
         row.source or 'here',
     )
+
+
+def _joined(*parts: str) -> str:
+    return ', '.join(part for part in parts if part)
 
 
 def _text(value: float | None, form: str) -> str:
     return '' if value is None else form.format(value)
 
 
+def _pair(first: float | None, second: float | None, form: str, unit: str) -> str:
+    if first is None and second is None:
+        return ''
+    return ' / '.join(_text(value, form) or '–' for value in (first, second)) + unit
+
+
 def page_table(rows: Sequence[Row]) -> str:
-    """Return rows as a table of Markdown: scene by scene, what is measured here before what is
-    published.
+    """Return rows that are scored as a table of Markdown: scene by scene, what is measured here
+    before what is published.
     """
     lines = [HEADS, ('---',) * len(HEADS)]
     for scene in PUBLISHED:
         own = [row for row in rows if row.scene == scene]
         lines += [
-            (f'{scene}: {row.system}', *cells_of(row)) for row in (*own, *PUBLISHED[scene].rows)
+            (f'{scene}: {row.system}', *cells_of(row))
+            for row in (*own, *PUBLISHED[scene].rows)
+            if row.precision_percent is not None
         ]
     return ''.join('| ' + ' | '.join(line) + ' |\n' for line in lines)

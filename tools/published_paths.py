@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 
 from segfloor_ros.apps.cli.terminal import Announce
 from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
@@ -132,7 +133,36 @@ def all_rows(measured: Sequence[PathRow]) -> list[PathRow]:
     return [*rows, *RECORDINGS, *FRAME_TIMES]
 
 
+PAGE_HEADS = ('drive', 'true', 'ORB-SLAM3', 'DynaSLAM', 'true here', *MODES)
+
+
 def paths_table(measured: Sequence[PathRow]) -> str:
-    """Return all rows as a table of Markdown."""
-    lines = [HEADS, ('---',) * len(HEADS), *map(words_of, all_rows(measured))]
+    """Return all rows as a table of Markdown, a line for each drive: published lengths, and ours
+    with the error of the path.
+    """
+    lines = [PAGE_HEADS, ('---',) * len(PAGE_HEADS)]
+    for scene, published in (*DRIVES.items(), *((row.drive, (row,)) for row in RECORDINGS[::2])):
+        rows = [row for row in (*published, *RECORDINGS) if row.drive == published[0].drive]
+        orb, dyna = ({row.system: row for row in rows}[name] for name in ('ORB-SLAM3', 'DynaSLAM'))
+        ours = {row.system: row for row in measured if row.drive == scene}
+        true_m = next((row.true_length_m for row in ours.values()), None)
+        lines.append(
+            (
+                orb.drive,
+                *(f'{value:.2f} m' for value in (orb.true_length_m, orb.length_m, dyna.length_m)),
+                '' if true_m is None else f'{true_m:.2f} m',
+                *(_ours(ours.get(system)) for system in MODES),
+            )
+        )
+    times = [f'{row.frame_s:.4g} s' for row in FRAME_TIMES]
+    frames = [[row.frame_s or 0.0 for row in measured if row.system == name] for name in MODES]
+    own = ['' if not some else f'{median(some):.3f} s' for some in frames]
+    lines.append(('median time of a frame', '', *times, '', *own))
     return ''.join('| ' + ' | '.join(line) + ' |\n' for line in lines)
+
+
+def _ours(row: PathRow | None) -> str:
+    if row is None:
+        return ''
+    tracked = '' if row.tracked_percent == 100 else f', {row.tracked_percent:.0f} % tracked'
+    return f'{row.length_m:.2f} m, {row.error_m:.3f} m off{tracked}'

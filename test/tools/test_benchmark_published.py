@@ -30,7 +30,7 @@ from tools.benchmark_published import (
     without_specks,
 )
 from tools.published_figures import HEADS, PUBLISHED, Row, page_table, parse_scenes
-from tools.published_paths import DRIVES, PathRow, paths_table, run_drive
+from tools.published_paths import DRIVES, PAGE_HEADS, PathRow, paths_table, run_drive
 
 CONFIGURATION = resolve()
 
@@ -69,7 +69,7 @@ def test_rows_are_kept_by_scene_and_system(tmp_path, monkeypatch):
     keep([Row('corridor1', 'a', precision_percent=1.23456), Row('corridor2', 'a')], [], 'once')
     keep(
         [Row('corridor1', 'a', precision_percent=99.0), Row('corridor1', 'b')],
-        [PathRow('town', 'b', length_m=2.0)],
+        [PathRow('town', next(iter(published_paths.MODES)), '', 50.0, 51.0, 90.0, 0.1, 0.03)],
         'again',
     )
     document = json.loads((tmp_path / 'published.json').read_text())
@@ -80,11 +80,13 @@ def test_rows_are_kept_by_scene_and_system(tmp_path, monkeypatch):
     ]  # fmt: skip
     assert rows[0].precision_percent == 99.0
     paths = paths_table([PathRow(**row) for row in document['paths']])
-    assert '| town | b | 2.00 m |' in paths
-    assert '| Husky 01, S | ORB-SLAM3 | 56.81 m | 53.54 m |' in paths
+    assert '| Husky 01, S | 53.54 m | 56.81 m | 55.67 m |' in paths
+    assert '| KITTI 00 | 3662.13 m | 3083.56 m | 3290.67 m |' in paths
+    assert '| 51.00 m | 50.00 m, 0.100 m off, 90 % tracked |  |' in paths
+    assert all(line.count('|') == len(PAGE_HEADS) + 1 for line in paths.splitlines())
     page = page_table(rows)
     lines = [line.strip('| ').split(' | ') for line in page.splitlines()]
-    assert lines[2][0] == 'corridor1: a' and '99.0 %' in page
+    assert lines[2][0] == 'corridor1: a' and lines[2][2] == '99.0 %'
     assert all(line.count('|') == len(HEADS) + 1 for line in page.splitlines())
 
 
@@ -186,9 +188,9 @@ def test_a_scene_is_rendered_once_mapped_and_scored(tmp_path):
     console.print(published_table([first.row]))
     text = console.export_text()
     assert '…' not in text
-    row = next(line for line in text.split('\n') if 'table' in line and ' Segfloor ' in line)
+    row = next(line for line in text.split('\n') if ' Segfloor ' in line)
     cells = [cell.strip() for cell in row.split('│')]
-    assert '99.6 %' in cells and '97.2 %' in cells and '220' in cells
+    assert cells[2:6] == ['1 cm, 220', '99.6 %', '– / 97.2 %', '– / 0.38 s']
     document = json.loads(json.dumps(as_document([first], [first.row])))
     assert document['rows'][0]['scene'] == 'corridor2'
     assert document['published'][0]['system'] == 'Segfloor'
