@@ -9,7 +9,6 @@ marks of the two pages.
 from __future__ import annotations
 
 import json
-import math
 import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -227,7 +226,7 @@ def _short_table(figures: dict[str, Any]) -> str:
 def _long_table(figures: dict[str, Any]) -> str:
     heads = ('recording', 'what', 'frames, length', 'tracked', 'path error',
              'road map, precision / recall', 'free cells', 'floor masks; false floor',
-             'frames with something that moves', 'camera: height, pitch', 'time')  # fmt: skip
+             'frames with something that moves', 'time')  # fmt: skip
     rows = []
     for name, drive in DRIVES.items():
         found = figures['drives'][name]
@@ -238,7 +237,7 @@ def _long_table(figures: dict[str, Any]) -> str:
             (
                 name, drive.about, f'{found["frames"]:.0f}, {found["length_m"]:.1f} m',
                 _tracked(found), _path(found), _pair(found, ''), _pair(found, 'free'), masks,
-                f'{found["moving_frames"]:.0f}', _mount(found), f'{found["wall_s"]:.0f} s',
+                f'{found["moving_frames"]:.0f}', f'{found["wall_s"]:.0f} s',
             )
         )  # fmt: skip
     return _table(heads, rows)
@@ -267,13 +266,6 @@ def _path(found: dict[str, float]) -> str:
             f'{found["path_error_m"]:.3f} m'
         )  # fmt: skip
     return f'ends {found["end_error_m"]:.2f} m off' if 'end_error_m' in found else '–'
-
-
-def _mount(found: dict[str, float]) -> str:
-    if 'camera_pitch_rad' not in found:
-        return 'not known'
-    pitch_deg = math.degrees(found['camera_pitch_rad'])
-    return f'{found["camera_height_m"]:.3g} m, {pitch_deg:.1f}°'
 
 
 def _pair(found: dict[str, float], kind: str) -> str:
