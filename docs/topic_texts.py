@@ -29,8 +29,8 @@ ABOUT = {
         'About where base_link is in map, as RViz publishes it: the camera is looked for there.'
     ),
     'pose': (
-        'Every tracked frame: base_link in map, with its covariance in the map around it. Published '
-        'while someone listens.'
+        'Every tracked frame: base_link in map, with its covariance in the map around it. '
+        'Published while someone listens.'
     ),
     'odometry/corrected': (
         'What came on odometry before the mount of the camera was known, or the map was found '

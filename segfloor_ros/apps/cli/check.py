@@ -49,12 +49,17 @@ from segfloor_ros.core.files.writing import (
 )
 from segfloor_ros.core.geometry import Pose2d
 
-COLUMNS = ('tracked_percent', 'path_error_m', 'precision_percent', 'recall_percent', 'time_ratio')
+COLUMNS = {
+    'tracked_percent': 'tracked %',
+    'path_error_m': 'error m',
+    'precision_percent': 'prec. %',
+    'recall_percent': 'recall %',
+    'time_ratio': 'time',
+}
+LENGTHS = {'length_m': 'length m', 'true_length_m': 'true m'}
 JUNIT, PAGE, FAILED = 'junit.xml', 'suite.html', 'failed.txt'
 FILES = (*OUTPUT_NAMES, MEASURED, LOG, SAVED_MAP, FAILED)
 """In the folder of a recording."""
-
-HEADINGS = ('tracked %', 'error m', 'prec. %', 'recall %', 'time')
 
 
 def check_suite(
@@ -254,13 +259,15 @@ def _print_progress(checked: Checked, done: int, total: int) -> None:
 
 def _table(result: SuiteResult, described: Suite) -> Table:
     methods = list(described.published)
-    table = figure_table('recording', 'result', *HEADINGS, *methods)
+    is_length = described.published_measure == 'length_m'
+    columns = {**COLUMNS, **LENGTHS} if is_length else COLUMNS
+    table = figure_table('recording', 'result', *columns.values(), *methods)
     if methods:
         sources = (f'{method}: {source}' for method, source in described.published.items())
-        table.caption = 'error m of ' + '; '.join(sources)
+        table.caption = f'{"length" if is_length else "error"} m of ' + '; '.join(sources)
     for entry, checked in zip(described.entries, result.recordings, strict=True):
         state = Text(checked.state, 'green' if checked.holds else 'red')
-        values = [checked.measured.get(name) for name in COLUMNS]
+        values = [checked.measured.get(name) for name in columns]
         values += [entry.published.get(method) for method in methods]
         cells = ('' if value is None else number(value) for value in values)
         table.add_row(checked.name, state, *cells)

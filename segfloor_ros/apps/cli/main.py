@@ -49,7 +49,7 @@ COMMANDS = {
     ),
     'convert': (
         'recordings:convert',
-        'Convert a recording to a rosbag2 (mcap) with images, CameraInfo and what was measured.',
+        'Convert a recording to a rosbag2 (mcap), or to a folder as of KITTI or TUM RGB-D.',
     ),
     'record': (
         'recordings:record',

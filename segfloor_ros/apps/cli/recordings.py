@@ -30,6 +30,7 @@ from segfloor_ros.apps.map_files import is_map, load_map, map_facts
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.bag_writer import BagWriter, ImageCoding, NewBag
 from segfloor_ros.apps.recordings.bag_writer import convert as write_bag
+from segfloor_ros.apps.recordings.folder_writer import Layout, layout_for, read_truth, write_folder
 from segfloor_ros.apps.recordings.opening import Inspection, Stream, inspect_recording, size_mb
 from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.apps.results_folder import read_summary
@@ -267,24 +268,51 @@ def view(
 @terminal.with_options
 def convert(
     options: terminal.InputOptions,
-    out: Annotated[Path, typer.Argument(help='New bag, e.g. drive.mcap.', metavar='OUT.mcap')],
+    out: Annotated[
+        Path, typer.Argument(help='New bag, e.g. drive.mcap, or new folder.', metavar='OUT')
+    ],
+    layout: Annotated[
+        Layout | None,
+        typer.Option(
+            help='What is written; else a bag becomes a folder, of TUM with depth in place of '
+            'right images, of KITTI without, and anything else a bag.',
+            show_default=False,
+        ),
+    ] = None,
+    truth: Annotated[
+        str | None,
+        typer.Option(
+            metavar='TOPIC',
+            help='True poses for a folder: an Odometry of the bag, or a file (TUM or KITTI).',
+        ),
+    ] = None,
     images: Annotated[
-        ImageCoding, typer.Option(help='How images are kept; raw and png are exact.')
+        ImageCoding, typer.Option(help='How images are kept in a bag; raw and png are exact.')
     ] = ImageCoding.raw,
     as_json: terminal.Json = False,
 ) -> None:
-    """Convert a recording to a rosbag2 (mcap) with images, CameraInfo and what was measured.
+    """Convert a recording to a rosbag2 (mcap), or to a folder as of KITTI or TUM RGB-D.
 
     \b
     segfloor convert sequences/06 drive.mcap --images png
+    segfloor convert drive.mcap sequences/07 --truth /ground_truth
     """
     settings = options.configuration().stereo_camera
     source = open_source(settings)
+    layout = layout or layout_for(user_path(settings.input), out, source)
+    if layout is Layout.bag and truth is not None:
+        raise SettingsError('--truth goes with a folder: give --layout kitti or tum')
+    if layout is not Layout.bag and images is ImageCoding.jpeg:
+        raise SettingsError('--images jpeg goes with a bag; the images of a folder are PNG')
     terminal.print_sensors(source.sensors)
     has_depth = any(sensor.name == DEPTH and not sensor.used for sensor in source.sensors)
     depth = open_source(dataclasses.replace(settings, depth=True)) if has_depth else None
+    poses = None if truth is None else read_truth(truth, settings, source.calibration.left)
     with terminal.progress_bar('converting', source.frame_count) as progress:
-        pairs = write_bag(source, out, images, progress, depth)
+        if layout is Layout.bag:
+            pairs = write_bag(source, out, images, progress, depth)
+        else:
+            pairs = write_folder(source, out, layout, progress, depth, poses)
     if as_json:
         terminal.print_json({'pairs': pairs, 'size_mb': size_mb(out), 'out': str(out)})
     console.print(f'{pairs} pairs, {size_mb(out):.1f} MB: {out}')

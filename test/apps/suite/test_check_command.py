@@ -298,5 +298,14 @@ def test_paths_are_held_beside_published_ones_and_what_is_missing_is_said(room, 
     assert float(cells[3]) < 0.02
     assert cells[4:6] == ['', '']
     assert cells[-1] == '0.025'
-    assert 'a paper, table I' in done.stdout
+    assert 'error m of Other: a paper, table I' in done.stdout
     assert not (out / room.name / 'map.yaml').exists()
+    lengths = BENCHMARK.format(room=room) + 'published_measure: length_m\n'
+    suite.write_text(lengths.replace('0.025', '0.31'))
+    done = check(suite, '--out', out, '--data', room.parent)
+    assert done.returncode == 0, done.stderr
+    row = next(line for line in done.stdout.splitlines() if f'{room.name} ' in line and '│' in line)
+    ours, true, published = (cell.strip() for cell in row.strip('│').split('│')[-3:])
+    assert float(ours) == pytest.approx(float(true), rel=0.1)
+    assert published == '0.31'
+    assert 'length m of Other: a paper, table I' in done.stdout

@@ -43,6 +43,17 @@ def test_points_of_a_place_are_tracked_again_though_none_of_them_was_seen_lately
     np.testing.assert_array_equal(local.point_ids, np.arange(10))
 
 
+def test_smaller_novelty_makes_more_keyframes():
+    def keyframes(novelty):
+        settings = StereoSlamSettings(num_features=600, keyframe_novelty=novelty)
+        slam = equipped_slam(CAMERA, settings, MOUNT)
+        drive(slam, StereoRoom(), [planar_pose(0.02 * k, 0, 0) for k in range(14)])
+        return len(slam.map.keyframes)
+
+    few, usual, many = (keyframes(novelty) for novelty in (3.0, 1.0, 0.3))
+    assert few < usual < many
+
+
 @pytest.mark.parametrize('seed', [0, 1, 2])
 def test_patches_give_the_pose_better_than_corners(seed):
     room = StereoRoom(seed)

@@ -61,7 +61,7 @@ class FrontEnd:
         self, settings: StereoSlamSettings, sparse_map: SparseMap, body: BodySensors
     ) -> None:
         self.motion = CameraMotion(settings.max_speed_mps, body)
-        self.local = LocalMap(sparse_map, settings.keyframe_max_frames)
+        self.local = LocalMap(sparse_map, settings.keyframe_max_frames, settings.keyframe_novelty)
         self.follower = Follower(sparse_map)
         self.frame_to_frame = FrameToFrame(sparse_map.rig, settings.fast_threshold)
         self.tracker = Tracker(sparse_map)
