@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import math
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -38,6 +39,7 @@ from segfloor_ros.nodes.messages.topics import (
     CORRECTED,
     FRAME_PARTS,
     FRESH_S,
+    IMAGES,
     KEYFRAME_PARTS,
     MAP_LOADED,
     MAP_PART,
@@ -221,8 +223,8 @@ class SlamTopics:
 
 
 class SlamResults:
-    """Publishes what SLAM has found out about frames, and reports how it went: one by one, since
-    others need time to take each of them.
+    """Publishes what SLAM has found out about frames, and reports how it went. Results that were
+    held back go out at a rate that others keep up with, however busy tracking is meanwhile.
     """
 
     def __init__(self, node: AnyStageNode, transforms: Transforms, watch: Watch) -> None:
@@ -231,6 +233,7 @@ class SlamResults:
         self._transforms = transforms
         self._watch = watch
         self._unsent: deque[tuple[FrameResult, StereoSlam, float]] = deque()
+        self._sent_s = 0.0
         node.inputs.repeat(self._send_next)
 
     def reset(self, map_start_ns: int, is_loaded: bool = False) -> None:
@@ -277,9 +280,14 @@ class SlamResults:
         reporter.report(stamp_ns, Level.WARN, words, input_faults=_faults_json(slam))
 
     def _send_next(self) -> float:
-        """Publish the oldest result that is not yet; return in how many seconds the next is due."""
-        if self._unsent:
+        """Publish the oldest results that are not yet, one per `LEAST_PERIOD_S` since the last
+        call; return in how many seconds the next is due.
+        """
+        now_s = time.monotonic()
+        due = int(min((now_s - self._sent_s) / LEAST_PERIOD_S, IMAGES.depth))
+        for _ in range(min(max(due, 1), len(self._unsent))):
             self._publish(*self._unsent.popleft())
+        self._sent_s = now_s
         return LEAST_PERIOD_S if self._unsent else LOOK_S
 
     def _publish(self, result: FrameResult, slam: StereoSlam, milliseconds: float) -> None:

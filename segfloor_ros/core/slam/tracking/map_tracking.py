@@ -51,7 +51,7 @@ from segfloor_ros.core.slam.tracking.patch_alignment import (
     align_patches,
     measure_disparity,
 )
-from segfloor_ros.core.slam.tracking.pose import Consensus, PoseEstimate, Searched, solve_pnp
+from segfloor_ros.core.slam.tracking.pose import Consensus, PoseEstimate, Searched, differ, solve_pnp
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
 
@@ -107,6 +107,8 @@ class Tracker:
             coarse = self._coarse(features, local_ids, start)
             if coarse is None:
                 continue
+            if best is not None and is_proof(most) and not differ(coarse, best.estimate):
+                break
             track = self.track_at(images, features, local_ids, coarse.T_camera_world)
             if track is None:
                 continue
