@@ -1,6 +1,7 @@
-"""The five nodes in one process: same names, topics, services and parameters.
+"""The five nodes in one program: same names, topics, services and parameters.
 
-The camera is among them where `input` names a recording or a device.
+SLAM has a process of its own, forked, so that nothing else takes Python's lock from tracking. The
+camera is among the nodes where `input` names a recording or a device.
 """
 
 from __future__ import annotations
@@ -15,13 +16,18 @@ from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 from segfloor_ros.nodes.shared.running import run_nodes
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
-STAGES = (StereoSlamNode, FloorSegmentationNode, CloudLabellingNode, OccupancyGridNode)
+BEHIND = (FloorSegmentationNode, CloudLabellingNode, OccupancyGridNode)
 
 
-def make_nodes() -> list[Node]:
-    """Make the nodes of the pipeline."""
+def make_slam() -> list[Node]:
+    """Make the node that tracks and maps."""
+    return [StereoSlamNode()]
+
+
+def make_others() -> list[Node]:
+    """Make the other nodes of the pipeline."""
     nodes: list[Node] = [make_stereo_camera()] if _has_input() else []
-    return [*nodes, *(make() for make in STAGES)]
+    return [*nodes, *(make() for make in BEHIND)]
 
 
 def _has_input() -> bool:
@@ -35,7 +41,7 @@ def _has_input() -> bool:
 
 def main() -> None:
     """Run the nodes."""
-    run_nodes(make_nodes)
+    run_nodes(make_slam, make_others)
 
 
 if __name__ == '__main__':

@@ -51,7 +51,13 @@ from segfloor_ros.core.slam.tracking.patch_alignment import (
     align_patches,
     measure_disparity,
 )
-from segfloor_ros.core.slam.tracking.pose import Consensus, PoseEstimate, Searched, differ, solve_pnp
+from segfloor_ros.core.slam.tracking.pose import (
+    Consensus,
+    PoseEstimate,
+    Searched,
+    differ,
+    solve_pnp,
+)
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
 
