@@ -6,15 +6,12 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import gc
 import itertools
 import logging
-import os
 import signal
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -32,7 +29,6 @@ from rclpy.parameter import Parameter
 from rclpy.utilities import remove_ros_args
 
 from segfloor_ros.core.errors import SegfloorError, SettingsError
-from segfloor_ros.core.processes import end_with_parent
 from segfloor_ros.core.settings import SettingSpec, suggestion
 from segfloor_ros.nodes.messages.topics import prepare_middleware
 from segfloor_ros.nodes.settings.shared import ROS_PARAMETERS, NodeSettings
@@ -45,8 +41,6 @@ M_ARENA_MAX = -8
 """Of glibc's malloc.h."""
 
 Settings = TypeVar('Settings', bound=NodeSettings)
-
-MakeNodes = Callable[[], Sequence[Node]]
 
 
 def run_node(make_node: Callable[[], Node]) -> None:
@@ -116,15 +110,11 @@ def _ignore(number: int, frame: object) -> None:
     """Not SIG_IGN: rclpy gives back the handler that it found to Python."""
 
 
-def run_nodes(make_nodes: MakeNodes, *others: MakeNodes) -> None:
-    """Run nodes in one executor, like `run_node`. others: each makes the nodes of one more process.
-    Such a process shares the memory of what is imported, but not Python's lock. It starts when the
-    nodes before it are made; when one process ends, all end.
-    """
+def run_nodes(make_nodes: Callable[[], Sequence[Node]]) -> None:
+    """Run nodes in one executor, like `run_node`."""
     logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
     status = 0
     nodes: Sequence[Node] = ()
-    helpers: list[Helper] = []
     signal.signal(signal.SIGINT, _interrupt)
     for number in (signal.SIGTERM, signal.SIGHUP):  # rclpy handles SIGTERM later
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -133,14 +123,11 @@ def run_nodes(make_nodes: MakeNodes, *others: MakeNodes) -> None:
         _share_one_heap()
         cv2.setNumThreads(-1)  # OpenCV with TBB asks the environment only then
         prepare_middleware()
-        make_nodes = _forked(make_nodes, others, helpers)
         _begin_ros(sys.argv)
         executor = SingleThreadedExecutor()
         nodes = make_nodes()
         for node in nodes:
             executor.add_node(node)
-        for helper in helpers:
-            helper.start()
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
@@ -156,59 +143,12 @@ def run_nodes(make_nodes: MakeNodes, *others: MakeNodes) -> None:
             raise
     finally:
         signal.signal(signal.SIGINT, _ignore)
-        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
-        status = max([status, *(helper.end() for helper in helpers)])
         # Python gives its own handlers up before it ends.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.exit(status)
-
-
-@dataclass(frozen=True)
-class Helper:
-    """One more process of a program. pipe: it waits for a byte here before it begins."""
-
-    process_id: int
-    pipe: int
-
-    def start(self) -> None:
-        """Let it begin."""
-        os.write(self.pipe, b'!')
-
-    def end(self) -> int:
-        """End it and return its exit status; one that has not begun ends when the pipe closes."""
-        os.close(self.pipe)
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(self.process_id, signal.SIGINT)
-        code = os.waitstatus_to_exitcode(os.waitpid(self.process_id, 0)[1])
-        return code if code >= 0 else 128 - code
-
-
-def _forked(make_nodes: MakeNodes, others: Sequence[MakeNodes], helpers: list[Helper]) -> MakeNodes:
-    """Fork a process for each of the others, before there are threads; returns what this process is
-    to make, and adds to `helpers` in the first one only.
-    """
-    if others:
-        gc.freeze()  # what is not collected stays shared
-        signal.signal(signal.SIGCHLD, _interrupt)
-    for make_others in others:
-        reading, writing = os.pipe()
-        parent_id, process_id = os.getpid(), os.fork()
-        if process_id:
-            os.close(reading)
-            helpers.append(Helper(process_id, writing))
-            continue
-        end_with_parent(parent_id)
-        for pipe in (writing, *(helper.pipe for helper in helpers)):
-            os.close(pipe)
-        helpers.clear()
-        if not os.read(reading, 1):
-            raise KeyboardInterrupt
-        os.close(reading)
-        return make_others
-    return make_nodes
 
 
 def descriptor(spec: SettingSpec) -> ParameterDescriptor:
