@@ -51,7 +51,7 @@ from segfloor_ros.nodes.messages.topics import (
     make_header,
 )
 from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
-from segfloor_ros.nodes.shared.inputs import LEAST_PERIOD_S, LOOK_S
+from segfloor_ros.nodes.shared.inputs import LEAST_PERIOD_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.nodes.slam_camera import Watch
@@ -234,7 +234,6 @@ class SlamResults:
         self._watch = watch
         self._unsent: deque[tuple[FrameResult, StereoSlam, float]] = deque()
         self._sent_s = 0.0
-        node.inputs.repeat(self._send_next)
 
     def reset(self, map_start_ns: int, is_loaded: bool = False) -> None:
         """Publish about another map from now on, of a camera whose mount is not known."""
@@ -253,8 +252,7 @@ class SlamResults:
             self.mount = None
             self.topics.begin_map(self.topics.map_start_ns + 1)
         self._unsent.extend((result, slam, milliseconds / len(results)) for result in results)
-        if len(self._unsent) == 1:
-            self._send_next()
+        self.send_due()
 
     def announce(self, result: FrameResult, frame: StereoFrame, moving: Region | None) -> None:
         """Publish pose and images of a keyframe at once, while the map takes it in; its floor is
@@ -279,16 +277,15 @@ class SlamResults:
         reporter.health.waits(words)
         reporter.report(stamp_ns, Level.WARN, words, input_faults=_faults_json(slam))
 
-    def _send_next(self) -> float:
+    def send_due(self) -> None:
         """Publish the oldest results that are not yet, one per `LEAST_PERIOD_S` since the last
-        call; return in how many seconds the next is due.
+        call.
         """
         now_s = time.monotonic()
         due = int(min((now_s - self._sent_s) / LEAST_PERIOD_S, IMAGES.depth))
         for _ in range(min(max(due, 1), len(self._unsent))):
             self._publish(*self._unsent.popleft())
         self._sent_s = now_s
-        return LEAST_PERIOD_S if self._unsent else LOOK_S
 
     def _publish(self, result: FrameResult, slam: StereoSlam, milliseconds: float) -> None:
         if self.mount is None and result.tracked and slam.mount is not None:

@@ -95,7 +95,7 @@ class Tracker:
         expected: PoseEstimate | None,
     ) -> Track | None:
         """Return the pose of a frame with the most evidence, of those found from some starts, tried
-        in order until a second leads to the best, or one that must be near is proven and is where the
+        in order until a second one leads there, or one that must be near is proven and is where the
         camera was expected; its observations have the disparity offset. None where nothing is
         proven.
         """
