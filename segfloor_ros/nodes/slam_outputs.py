@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import math
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -39,7 +38,6 @@ from segfloor_ros.nodes.messages.topics import (
     CORRECTED,
     FRAME_PARTS,
     FRESH_S,
-    IMAGES,
     KEYFRAME_PARTS,
     MAP_LOADED,
     MAP_PART,
@@ -51,7 +49,6 @@ from segfloor_ros.nodes.messages.topics import (
     make_header,
 )
 from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
-from segfloor_ros.nodes.shared.inputs import LEAST_PERIOD_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.nodes.slam_camera import Watch
@@ -61,6 +58,9 @@ MAPPING_SUBMAP = 'lost; maps a submap until it recognises a place of the map'
 PARTS = {'cloud', 'grid'}
 """What the nodes behind know of a map."""
 
+
+AT_A_TIME = 2
+"""Results that are published together: more than a frame brings."""
 
 FRAME_NS = 80_000_000
 """Between small images: every third of a camera with 30 Hz, each of one with 10."""
@@ -223,8 +223,8 @@ class SlamTopics:
 
 
 class SlamResults:
-    """Publishes what SLAM has found out about frames, and reports how it went. Results that were
-    held back go out at a rate that others keep up with, however busy tracking is meanwhile.
+    """Publishes what SLAM has found out about frames, and reports how it went: few at a time, since
+    others need time to take each, but more than come, so that none waits behind those held back.
     """
 
     def __init__(self, node: AnyStageNode, transforms: Transforms, watch: Watch) -> None:
@@ -233,7 +233,7 @@ class SlamResults:
         self._transforms = transforms
         self._watch = watch
         self._unsent: deque[tuple[FrameResult, StereoSlam, float]] = deque()
-        self._sent_s = 0.0
+        self._send_more = node.inputs.later(self._send_some)
 
     def reset(self, map_start_ns: int, is_loaded: bool = False) -> None:
         """Publish about another map from now on, of a camera whose mount is not known."""
@@ -252,7 +252,7 @@ class SlamResults:
             self.mount = None
             self.topics.begin_map(self.topics.map_start_ns + 1)
         self._unsent.extend((result, slam, milliseconds / len(results)) for result in results)
-        self.send_due()
+        self._send_some()
 
     def announce(self, result: FrameResult, frame: StereoFrame, moving: Region | None) -> None:
         """Publish pose and images of a keyframe at once, while the map takes it in; its floor is
@@ -277,15 +277,12 @@ class SlamResults:
         reporter.health.waits(words)
         reporter.report(stamp_ns, Level.WARN, words, input_faults=_faults_json(slam))
 
-    def send_due(self) -> None:
-        """Publish the oldest results that are not yet, one per `LEAST_PERIOD_S` since the last
-        call.
-        """
-        now_s = time.monotonic()
-        due = int(min((now_s - self._sent_s) / LEAST_PERIOD_S, IMAGES.depth))
-        for _ in range(min(max(due, 1), len(self._unsent))):
+    def _send_some(self) -> None:
+        """Publish the oldest results that are not yet, and have the rest follow."""
+        for _ in range(min(AT_A_TIME, len(self._unsent))):
             self._publish(*self._unsent.popleft())
-        self._sent_s = now_s
+        if self._unsent:
+            self._send_more()
 
     def _publish(self, result: FrameResult, slam: StereoSlam, milliseconds: float) -> None:
         if self.mount is None and result.tracked and slam.mount is not None:

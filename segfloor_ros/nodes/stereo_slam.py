@@ -129,7 +129,6 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             self._work()
 
     def _look_again(self) -> None:
-        self._results.send_due()
         self._maps.announce()
         self._camera.find_images()
         self._look()
