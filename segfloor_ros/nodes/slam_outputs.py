@@ -50,7 +50,6 @@ from segfloor_ros.nodes.messages.topics import (
     make_header,
 )
 from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
-from segfloor_ros.nodes.shared.inputs import LEAST_PERIOD_S, LOOK_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.nodes.slam_camera import Watch
@@ -60,6 +59,9 @@ MAPPING_SUBMAP = 'lost; maps a submap until it recognises a place of the map'
 PARTS = {'cloud', 'grid'}
 """What the nodes behind know of a map."""
 
+
+AT_A_TIME = 2
+"""Results that are published together: more than a frame brings."""
 
 FRAME_NS = 80_000_000
 """Between small images: every third of a camera with 30 Hz, each of one with 10."""
@@ -226,8 +228,8 @@ class SlamTopics:
 
 
 class SlamResults:
-    """Publishes what SLAM has found out about frames, and reports how it went: one by one, since
-    others need time to take each of them.
+    """Publishes what SLAM has found out about frames, and reports how it went: few at a time, since
+    others need time to take each, but more than come, so that none waits behind those held back.
     """
 
     def __init__(self, node: AnyStageNode, transforms: Transforms, watch: Watch) -> None:
@@ -236,7 +238,7 @@ class SlamResults:
         self._transforms = transforms
         self._watch = watch
         self._unsent: deque[tuple[FrameResult, StereoSlam, float]] = deque()
-        node.inputs.repeat(self._send_next)
+        self._send_more = node.inputs.later(self._send_some)
 
     def reset(self, map_start_ns: int, is_loaded: bool = False) -> None:
         """Publish about another map from now on, of a camera whose mount is not known."""
@@ -255,8 +257,7 @@ class SlamResults:
             self.mount = None
             self.topics.begin_map(self.topics.map_start_ns + 1)
         self._unsent.extend((result, slam, milliseconds / len(results)) for result in results)
-        if len(self._unsent) == 1:
-            self._send_next()
+        self._send_some()
 
     def announce(self, result: FrameResult, frame: StereoFrame, moving: Region | None) -> None:
         """Publish pose and images of a keyframe at once, while the map takes it in; its floor is
@@ -281,11 +282,12 @@ class SlamResults:
         reporter.health.waits(words)
         reporter.report(stamp_ns, Level.WARN, words, input_faults=_faults_json(slam))
 
-    def _send_next(self) -> float:
-        """Publish the oldest result that is not yet; return in how many seconds the next is due."""
-        if self._unsent:
+    def _send_some(self) -> None:
+        """Publish the oldest results that are not yet, and have the rest follow."""
+        for _ in range(min(AT_A_TIME, len(self._unsent))):
             self._publish(*self._unsent.popleft())
-        return LEAST_PERIOD_S if self._unsent else LOOK_S
+        if self._unsent:
+            self._send_more()
 
     def _publish(self, result: FrameResult, slam: StereoSlam, milliseconds: float) -> None:
         if self.mount is None and result.tracked and slam.mount is not None:
