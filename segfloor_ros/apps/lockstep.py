@@ -436,7 +436,7 @@ class LockstepRun:
         of_floor = [self._said.get(about, words) for about, words in stages.floor.remarks.items()]
         faults = slam.rig_check.faults
         faults.update({name: self._faults_said.get(name, one) for name, one in faults.items()})
-        planes = stages.floor.fixture.planes
+        planes = np.reshape(stages.floor.fixture.planes, (-1, 3))
         floor = results_folder.floor_heights(planes[:, 2]) if has_map else None
         return results_folder.summarise(
             [results_folder.DriveFrame.of(result) for result in self._results],

@@ -162,33 +162,29 @@ class PlaneFit:
 
 class Fixture:
     """What the planes of frames say of how the camera is fixed to its base. problem: in words, once
-    their heights vary by more than robots sway: a hand does not hold a camera like that.
+    their heights vary by more than robots sway: a hand does not hold a camera like that. planes:
+    pitch, roll and height (3,) of the camera above each of them, in order.
     """
 
     def __init__(self) -> None:
         self.problem: str | None = None
-        self._planes: list[Array] = []
-
-    @property
-    def planes(self) -> Array:
-        """Pitch, roll and height (N, 3) of the camera above the planes of frames, in order."""
-        return np.reshape(self._planes, (-1, 3))
+        self.planes: list[Array] = []
 
     def usual(self, mounted: Array) -> Array:
         """Return pitch, roll and height (1, 3) of the camera in most frames, where that is not how
         it is mounted (3,); (0, 3) where it is, and while few frames were seen.
         """
-        usual = np.median(self._planes or [mounted], axis=0)
+        usual = np.median(self.planes or [mounted], axis=0)
         off = np.abs(usual - mounted) / (1.0, 1.0, mounted[2])
-        is_other = len(self._planes) >= LOOKS and (off > SURE * np.array(SWAY)).any()
+        is_other = len(self.planes) >= LOOKS and (off > SURE * np.array(SWAY)).any()
         return usual[None] if is_other else np.zeros((0, 3))
 
     def note(self, fit: PlaneFit) -> None:
         """Take in the plane of a frame."""
         if not (fit.evidence > PROVED and fit.is_seen):
             return
-        self._planes.append(fit.angles_height)
-        heights_m = np.array(self._planes)[:, 2]
+        self.planes.append(fit.angles_height)
+        heights_m = np.array(self.planes)[:, 2]
         # One and two sigmas to either side of the median: a few wrong planes do not count.
         low, minus, middle, plus, high = np.percentile(heights_m, (2.5, 16, 50, 84, 97.5))
         if len(heights_m) >= LOOKS and plus - minus > 2 * SWAY[2] * middle:
