@@ -95,7 +95,7 @@ class Tracker:
         expected: PoseEstimate | None,
     ) -> Track | None:
         """Return the pose of a frame with the most evidence, of those found from some starts, tried
-        in order until a second one leads there, or one that must be near is proven and is where the
+        in order until two lead to the same, or one that must be near is proven and is where the
         camera was expected; its observations have the disparity offset. None where nothing is
         proven.
         """
@@ -107,8 +107,6 @@ class Tracker:
             coarse = self._coarse(features, local_ids, start)
             if coarse is None:
                 continue
-            if best is not None and is_proof(most) and best.fits(coarse):
-                break
             track = self.track_at(images, features, local_ids, coarse.T_camera_world)
             if track is None:
                 continue
