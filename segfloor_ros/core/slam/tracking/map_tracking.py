@@ -107,6 +107,8 @@ class Tracker:
             coarse = self._coarse(features, local_ids, start)
             if coarse is None:
                 continue
+            if best is not None and is_proof(most) and best.fits(expected) and best.fits(coarse):
+                break
             track = self.track_at(images, features, local_ids, coarse.T_camera_world)
             if track is None:
                 continue
