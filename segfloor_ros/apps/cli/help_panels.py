@@ -12,6 +12,7 @@ BASIC = {
     'explore': '--out --robot --goals --seed --start-in --goal --minutes',
     'simulate': '--out --camera --set --list',
     'calibrate': '--out --square --board --marker --dictionary --check --from',
+    'convert': '--layout --images --truth --json --params --set --every --frames',
     'check': '--out --data --jobs --baseline --write-baseline --resume --view --json',
     'evaluate map': '--trajectory --align --overlay --json',
 }
