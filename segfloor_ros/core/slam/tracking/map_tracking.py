@@ -95,9 +95,9 @@ class Tracker:
         expected: PoseEstimate | None,
     ) -> Track | None:
         """Return the pose of a frame with the most evidence, of those found from some starts, tried
-        in order until two lead to the same, or one that must be near is proven and is where the
-        camera was expected; its observations have the disparity offset. None where nothing is
-        proven.
+        in order until two lead to the same, the second one roughly where the first was expected, or
+        one that must be near is proven and is where the camera was expected; its observations have
+        the disparity offset. None where nothing is proven.
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
