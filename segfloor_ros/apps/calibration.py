@@ -246,8 +246,9 @@ class CalibrationResult:
             share = self.seen_share(side)
             if share < COVERED:
                 lines.append(
-                    f'the board covers {share:.0%} of the {name} image, and beyond that the lens '
-                    'is a guess: add pairs with the board at the borders and in the corners, until '
+                    f'the board covers {int(100 * share)}% of the {name} image, and beyond that '
+                    'the lens is a guess: add pairs with the board at the borders and in the '
+                    'corners, until '
                     f'it covers {COVERED:.0%}'
                 )
         worst_px = max(self.rms_px, self.epipolar_rms_px)

@@ -437,7 +437,9 @@ class LockstepRun:
         faults = slam.rig_check.faults
         faults.update({name: self._faults_said.get(name, one) for name, one in faults.items()})
         planes = np.reshape(stages.floor.fixture.planes, (-1, 3))
-        floor = results_folder.floor_heights(planes[:, 2]) if has_map else None
+        # Those of a map that was loaded come before all stamps.
+        looks = sum(keyframe.stamp_ns >= 0 for keyframe in slam.map.keyframes)
+        floor = results_folder.floor_heights(planes[:, 2], looks) if has_map else None
         return results_folder.summarise(
             [results_folder.DriveFrame.of(result) for result in self._results],
             wall_s,

@@ -456,18 +456,18 @@ def _mount_rows(height_m: float | None, pitch_rad: float | None) -> list[tuple[s
     ]
 
 
-def floor_heights(heights_m: NDArray[np.floating]) -> dict[str, float]:
-    """Return how many keyframes show a plane (`planes`), of the heights (N,) of the camera above
-    these. If there are any, also the medians of all (`median_m`), of the first (`first_m`) and of
-    the last third (`last_m`) of the drive.
+def floor_heights(heights_m: NDArray[np.floating], looks: int) -> dict[str, float]:
+    """Return how many keyframes show a plane (`planes`), by the heights (N,) of the camera above
+    these, and of how many of this drive (`looks`). If there are any, also the medians of all
+    (`median_m`), of the first (`first_m`) and of the last third (`last_m`) of the drive.
     """
     count = len(heights_m)
     if not count:
-        return {'planes': 0}
+        return {'planes': 0, 'looks': looks}
     third = -(-count // 3)
     parts = {'median_m': heights_m, 'first_m': heights_m[:third], 'last_m': heights_m[-third:]}
     medians = {name: round(float(np.median(part)), 4) for name, part in parts.items()}
-    return {'planes': count, **medians}
+    return {'planes': count, 'looks': looks, **medians}
 
 
 def _floor_words(floor: Mapping[str, float] | None) -> str | None:

@@ -29,7 +29,8 @@ BEHIND = (FloorSegmentationNode, CloudLabellingNode, OccupancyGridNode)
 
 class Helper:
     """A forked process with the other nodes. It begins when it is told to; when one of the two
-    processes ends, so does the other.
+    processes ends, so does the other. When one is killed, the other goes as if it was killed, too:
+    what both keep for their next lives stays.
     """
 
     def __init__(self) -> None:
@@ -39,9 +40,9 @@ class Helper:
         parent_id, self._process_id = os.getpid(), os.fork()
         if self._process_id:
             os.close(reading)
-            signal.signal(signal.SIGCHLD, _end_as_well)
+            signal.signal(signal.SIGCHLD, self._end_as_well)
             return
-        end_with_parent(parent_id)
+        end_with_parent(parent_id, signal.SIGKILL)
         os.close(self._pipe)
         if os.read(reading, 1):
             os.close(reading)
@@ -62,11 +63,16 @@ class Helper:
         code = os.waitstatus_to_exitcode(os.waitpid(self._process_id, 0)[1])
         return code if code >= 0 else 128 - code
 
-
-def _end_as_well(number: int, frame: FrameType | None) -> None:
-    """Interrupt this process, whose helper has ended."""
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    signal.raise_signal(signal.SIGINT)
+    def _end_as_well(self, number: int, frame: FrameType | None) -> None:
+        """End this process where its helper has ended, not only stopped or gone on."""
+        options = os.WEXITED | os.WNOHANG | os.WNOWAIT
+        ended = os.waitid(os.P_PID, self._process_id, options)
+        if ended is None:
+            return
+        if ended.si_code != os.CLD_EXITED:
+            os._exit(128 + ended.si_status)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        signal.raise_signal(signal.SIGINT)
 
 
 def _make_others() -> list[Node]:

@@ -103,6 +103,24 @@ def wait_until(is_so: Callable[[], bool]) -> None:
         time.sleep(0.1)
 
 
+def test_a_process_that_is_stopped_and_goes_on_ends_nothing(tmp_path) -> None:
+    said = tmp_path / 'log'
+    with surroundings(), said.open('w') as log:
+        process = subprocess.Popen(PIPELINE, stdout=log, stderr=log)
+        try:
+            wait_until(lambda: f'[{SLAM}]' in said.read_text())
+            (helper,) = helpers_of(process)
+            for number in (signal.SIGSTOP, signal.SIGCONT):
+                os.kill(helper, number)
+                time.sleep(0.3)
+            assert is_running(process.pid) and is_running(helper)
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 0
+        finally:
+            process.kill()
+            process.wait()
+
+
 @pytest.mark.parametrize('victim', ['SLAM', 'the others'])
 def test_when_one_process_is_killed_the_other_one_ends(victim, tmp_path) -> None:
     said = tmp_path / 'log'

@@ -104,7 +104,7 @@ def editor_server(
     grid: OccupancyGrid, title: str, save: Save, port: int = 0
 ) -> tuple[ThreadingHTTPServer, str]:
     """Return a server of the page, on this machine alone, and its address. The address holds a
-    secret: other pages of the browser and other users of the machine cannot save.
+    secret: other pages of the browser, and who does not know it, cannot save.
     """
     secret = secrets.token_urlsafe(16)
     handler = partial(_Handler, page_of(grid, title), f'/{secret}/', partial(_saved, grid, save))
@@ -155,7 +155,7 @@ class _Handler(BaseHTTPRequestHandler):
             return self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
         try:
             status, line = HTTPStatus.OK, self._answer_to(self.rfile.read(int(length)))
-        except InputError as error:
+        except (InputError, OverflowError, RecursionError) as error:
             status, line = HTTPStatus.BAD_REQUEST, str(error)
         self._send(status, 'text/plain; charset=utf-8', line.encode())
 

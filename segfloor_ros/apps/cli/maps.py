@@ -271,6 +271,11 @@ def edit(
         if zones is not None:
             save_map(zones, beside, 'raw')
             words = f'{words}; keepout mask: {beside}; costmap_filter_info_server: {KEEPOUT}'
+        elif os.path.lexists(beside):
+            nothing = np.zeros(corrected.cells.shape, np.int8)
+            none = OccupancyGrid(nothing, corrected.resolution_m, corrected.origin_xy_m)
+            save_map(none, beside, 'raw')
+            words = f'{words}; no zone is left in the keepout mask: {beside}'
         console.print(words, soft_wrap=True)
         return words
 

@@ -196,21 +196,24 @@ def _doubts(summary: Mapping[str, Any]) -> list[str]:
     tracked, frames = summary['tracked_frames'], summary['frames']
     if tracked < frames:
         lines.append(
-            f'{tracked} of {frames} frames ({tracked / frames:.0%}) are in the map: it shows a '
-            'part of the drive'
+            f'{tracked} of {frames} frames ({int(100 * tracked / frames)}%) are in the map: it '
+            'shows a part of the drive'
         )
     if summary.get('interrupted'):
         lines.append('the drive was cut short: the map shows what came before')
     height_m, floor = summary['camera_height_m'], summary.get('floor')
     if height_m is None or floor is None:
         return lines
-    if floor['planes'] < LOOKS < summary['keyframes']:
+    planes, looks = floor['planes'], floor['looks']
+    if not looks:
+        return lines
+    if planes < min(LOOKS, looks):
         return [
             *lines,
-            f'{floor["planes"]} of {summary["keyframes"]} keyframes show the plane of the floor: '
-            'too few to check the height of the camera',
+            f'{planes} of {looks} keyframes show the plane of the floor: too few to check the '
+            'height of the camera',
         ]
-    sway_m, sigmas = SWAY[2] * height_m, SURE * 1.25 / math.sqrt(floor['planes'])
+    sway_m, sigmas = SWAY[2] * height_m, SURE * 1.25 / math.sqrt(planes)
     if abs(floor['median_m'] - height_m) > sway_m * max(1, sigmas):
         lines.append(
             f'the mount says that the camera is {height_m:.3f} m above the floor, single keyframes '

@@ -54,6 +54,10 @@ def layout_for(name: Path, out: Path, source: StereoSource) -> Layout:
     return Layout.tum if source.takes_depth else Layout.kitti
 
 
+ROUNDED_NS = 1000
+"""Times of seconds in a file are off by so much at most: a float has 16 digits."""
+
+
 def write_folder(
     source: StereoSource,
     out: Path,
@@ -89,6 +93,10 @@ def write_folder(
             made.mkdir()
             write = _write_tum if layout is Layout.tum else _write_kitti
             stamps_ns = write(made, source, depth, on_progress)
+            if not stamps_ns:
+                raise InputError(
+                    f'{source.name}: no pair of images can be read; nothing is written'
+                )
             _write_measurements(made, source)
             if truth is not None:
                 _write_truth(made, layout, at_times(truth, stamps_ns, source.name))
@@ -244,19 +252,20 @@ def at_times(truth: Trajectory, stamps_ns: list[int], name: str) -> Trajectory:
     speed. Raises InputError where a stamp lies before the first pose or after the last.
     """
     at, known = np.array(stamps_ns, np.int64), truth.stamp_ns
-    if len(known) < 2 or at[0] < known[0] or at[-1] > known[-1]:
+    if len(known) < 2 or at[0] < known[0] - ROUNDED_NS or at[-1] > known[-1] + ROUNDED_NS:
         span = f'{seconds(int(known[0]))} to {seconds(int(known[-1]))} s' if len(known) else 'none'
         raise InputError(
             f'{name}: the true poses ({span}) do not cover the images, {seconds(int(at[0]))} to '
             f'{seconds(int(at[-1]))} s; choose a part with --start and --frames'
         )
     from_first_s, at_s = 1e-9 * (known - known[0]), 1e-9 * (at - known[0])
+    at_s = at_s.clip(0.0, from_first_s[-1])
     poses = np.tile(np.eye(4), (len(at), 1, 1))
     for axis in range(3):
         poses[:, axis, 3] = np.interp(at_s, from_first_s, truth.poses[:, axis, 3])
     turns = Slerp(from_first_s, Rotation.from_matrix(truth.poses[:, :3, :3]))
     poses[:, :3, :3] = turns(at_s).as_matrix()
-    exact = np.searchsorted(known, at)
+    exact = np.searchsorted(known, at).clip(max=len(known) - 1)
     there = known[exact] == at
     poses[there] = truth.poses[exact[there]]
     return Trajectory(at, poses)

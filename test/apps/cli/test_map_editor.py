@@ -130,6 +130,10 @@ def test_what_the_page_saves_is_written_beside_the_map(page, tmp_path) -> None:
     assert load_map(tmp_path / 'corrected.yaml').cells[3].tolist() == [X, U, U, U, U]
     assert load_map(tmp_path / 'corrected_keepout.yaml').cells[0].tolist() == [X, X, X, F, F]
     assert (tmp_path / 'map.pgm').read_bytes() == before
+    # A zone that is taken back leaves the mask, too.
+    _, line = answer(f'{address}save', json.dumps({'strokes': [wall]}).encode())
+    assert 'no zone is left in the keepout mask' in line
+    assert (load_map(tmp_path / 'corrected_keepout.yaml').cells == F).all()
 
 
 def test_only_who_has_the_address_can_save_and_nonsense_is_refused(page, tmp_path) -> None:
@@ -138,7 +142,9 @@ def test_only_who_has_the_address_can_save_and_nonsense_is_refused(page, tmp_pat
     assert [answer(f'{root}{path}')[0] for path in ('/', '/x/')] == [404, 404]
     assert answer(f'{root}/x/save', b'{"strokes": []}')[0] == 404
     assert answer(f'{address}save', b'no json') == (400, 'not JSON')
-    assert answer(f'{address}save', b'{}')[0] == 400
+    far = [{'tool': 'wall', 'points': [[int('9' * 400), 0]], 'width_m': 0.2}]
+    for body in (b'{}', b'[' * 100_000, json.dumps({'strokes': far}).encode()):
+        assert answer(f'{address}save', body)[0] == 400
     assert not (tmp_path / 'corrected.yaml').exists()
 
 

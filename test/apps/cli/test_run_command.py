@@ -450,7 +450,7 @@ FAULT = {'fault': 'rows_apart', 'value': 3.2, 'unit': 'px', 'remedy': 'calibrate
 
 
 def heights(median_m, first_m, last_m):
-    return {'planes': 60, 'median_m': median_m, 'first_m': first_m, 'last_m': last_m}
+    return {'planes': 60, 'looks': 60, 'median_m': median_m, 'first_m': first_m, 'last_m': last_m}
 
 
 SUBMAP = {'first_frame': 4, 'last_frame': 9, 'merged': False}
@@ -474,13 +474,19 @@ SUBMAP = {'first_frame': 4, 'last_frame': 9, 'merged': False}
         ({'floor': heights(1.03, 1.0, 1.03)}, 'nothing: the figures are sound'),
         ({'floor': heights(1.05, 1.05, 1.05)}, 'the mount says that the camera is 1.000 m'),
         # Of 9 planes the median errs by up to 5 %, and those of 3 differ by up to 12 %.
-        ({'floor': heights(1.045, 0.95, 1.06) | {'planes': 9}}, 'nothing: the figures are sound'),
+        (
+            {'floor': heights(1.045, 0.95, 1.06) | {'planes': 9, 'looks': 9}},
+            'nothing: the figures are sound',
+        ),
         ({'floor': heights(1.1, 1.1, 1.1)}, 'the mount says that the camera is 1.000 m above the'),
         ({'floor': heights(1.0, 0.95, 1.05)}, 'the height of the camera above the floor changes'),
         (
-            {'floor': heights(1.0, 1.0, 1.0) | {'planes': 2}, 'keyframes': 30},
+            {'floor': heights(1.0, 1.0, 1.0) | {'planes': 2, 'looks': 30}},
             '2 of 30 keyframes show the plane',
         ),
+        ({'floor': {'planes': 0, 'looks': 2}}, '0 of 2 keyframes show the plane'),
+        ({'floor': {'planes': 0, 'looks': 0}}, 'nothing: the figures are sound'),
+        ({'tracked_frames': 1499, 'frames': 1500}, '1499 of 1500 frames (99%) are in the map'),
         ({'floor': None}, 'nothing: the figures are sound'),
     ],
 )
@@ -500,7 +506,7 @@ def test_a_report_says_what_to_do_next(result, tmp_path, figures, words):
 def test_a_run_measures_the_height_of_the_camera_in_single_keyframes(result):
     summary = json.loads((result[0] / 'summary.json').read_text())
     floor = summary['floor']
-    assert 0 < floor['planes'] <= summary['keyframes']
+    assert 0 < floor['planes'] <= floor['looks'] == summary['keyframes']
     for name in ('median_m', 'first_m', 'last_m'):
         assert floor[name] == pytest.approx(MOUNT.height_m, rel=0.02)
     assert f'{floor["median_m"]:.3f} m ({floor["planes"]} planes' in result[1].stdout
@@ -508,10 +514,10 @@ def test_a_run_measures_the_height_of_the_camera_in_single_keyframes(result):
 
 def test_heights_of_a_drive_are_medians_of_all_and_of_its_ends():
     heights_m = np.array([1.0, 1.0, 5.0, 2.0, 2.0, 2.0, 3.0, 3.0, 3.0])
-    assert floor_heights(heights_m) == {
-        'planes': 9, 'median_m': 2.0, 'first_m': 1.0, 'last_m': 3.0,
+    assert floor_heights(heights_m, 12) == {
+        'planes': 9, 'looks': 12, 'median_m': 2.0, 'first_m': 1.0, 'last_m': 3.0,
     }  # fmt: skip
-    assert floor_heights(heights_m[:0]) == {'planes': 0}
+    assert floor_heights(heights_m[:0], 3) == {'planes': 0, 'looks': 3}
 
 
 def test_a_report_names_its_colours_and_the_length_of_the_path(result, tmp_path):

@@ -27,7 +27,7 @@ from command_line import segfloor
 
 from segfloor_ros.apps.recordings import StereoSource
 from segfloor_ros.apps.recordings.bag_writer import convert
-from segfloor_ros.apps.recordings.folder_writer import Layout, write_folder
+from segfloor_ros.apps.recordings.folder_writer import Layout, at_times, write_folder
 from segfloor_ros.apps.trajectory import Trajectory, read_trajectory
 from segfloor_ros.core.camera.recording import MeasurementLog
 from segfloor_ros.core.errors import InputError
@@ -163,6 +163,18 @@ def test_poses_of_a_file_must_cover_the_images(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r'0\.000000000 to 0\.150000000 s\) do not cover'):
         write_folder(source, tmp_path / 'out', Layout.kitti, truth=part)
     assert not (tmp_path / 'out').exists()
+
+
+def test_times_of_a_file_that_are_rounded_cover_the_images(tmp_path: Path) -> None:
+    """Seconds since 1970 have seven digits after the point as floats."""
+    first_ns = 1_700_000_000_000_000_150
+    stamps_ns = [first_ns, first_ns + 100 * MS]
+    rounded = np.rint(np.array([stamp_ns / 1e9 for stamp_ns in stamps_ns]) * 1e9).astype(np.int64)
+    assert rounded[0] > stamps_ns[0]
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 1.0
+    found = at_times(Trajectory(rounded, poses), stamps_ns, 'drive')
+    np.testing.assert_allclose(found.poses[:, 0, 3], [0.0, 1.0], atol=1e-5)
 
 
 @pytest.mark.parametrize('name', ['file', 'folder', 'link'])
