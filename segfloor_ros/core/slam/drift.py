@@ -17,8 +17,9 @@ from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.twists import adjoint, se3_exp, se3_log, skew
 
 AXIS_SIGMA_PX, SCALE_SIGMA = 0.7, 0.0017
-"""Of a calibration: the principal point, and focal length and baseline as shares (Zhang, A flexible
-new technique for camera calibration, IEEE T-PAMI 2000, table 1)."""
+"""Of a calibration by some pictures of a board: the principal point, and focal length and baseline
+as shares; of the size that Zhang reports (A flexible new technique for camera calibration, IEEE
+T-PAMI 2000)."""
 
 
 class DriftMeter:
