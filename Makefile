@@ -2,7 +2,7 @@
 # make demo   record a drive, map it, score it   make lint   style and types only
 # make explore      a simulated robot maps a room by itself
 # make test-slow    the tests left out of make test        make site   the documentation, in site/
-# make test-noble   the tests with the versions of Ubuntu 24.04, in .venv-noble
+# make test-noble   what depends on versions with those of Ubuntu 24.04, in .venv-noble
 # PYTHON=/path/to/python chooses the interpreter (3.10 or newer), PYTHON312=... that of test-noble.
 
 CANDIDATES := $(PYTHON) python3 python3.12 python3.11 python3.13 python3.10
@@ -13,11 +13,11 @@ STAMP := $(VENV)/.installed
 TF := $(VENV)/.tf2_msgs
 NOBLE := .venv-noble
 NOBLE_CANDIDATES := $(PYTHON312) python3.12 $(wildcard $(HOME)/.pyenv/versions/3.12.*/bin/python)
-# What processes and links do to each other does not depend on the four libraries.
-APART_FROM := nodes/test_faults nodes/test_restarts nodes/test_two_hosts nodes/test_tf nodes/test_reset \
-  nodes/test_lifecycle nodes/test_on_demand nodes/test_diagnoses nodes/test_pipeline test_package \
-  nodes/test_launched nodes/test_losses nodes/test_lossless nodes/test_middleware \
-  nodes/test_ros2_commands
+# What depends on versions: whatever computes with NumPy, OpenCV and SciPy, and the readers of YAML.
+# Processes, links, launch files, pages and workflows behave the same with either, and so does the
+# simulation, whose MuJoCo is of one version.
+ON_VERSIONS := core apps/recordings apps/evaluation apps/test_chessboard_calibration.py \
+  apps/test_results_and_trajectory.py nodes/messages nodes/test_yaml_files.py nodes/test_settings.py
 IS_312 := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 12))
 # Tests of one module stay together where they can: its fixtures are made once.
 PARALLEL := -n 2 --dist worksteal
@@ -62,7 +62,7 @@ test-slow: $(STAMP) $(TF)
 	$(BIN)/python -m pytest $(PARALLEL) -m slow
 
 test-noble: $(NOBLE)/.installed
-	$(NOBLE)/bin/python -m pytest $(PARALLEL) -m 'not slow' $(APART_FROM:%=--ignore=test/%.py)
+	$(NOBLE)/bin/python -m pytest $(PARALLEL) -m 'not slow' $(ON_VERSIONS:%=test/%)
 
 noble-python:
 	@for python in $(NOBLE_CANDIDATES); do \

@@ -45,6 +45,12 @@ def test_what_is_published_is_what_was_built_and_tried_and_no_token_is_kept() ->
     assert 'secrets.' not in text
 
 
+def test_the_slow_tests_run_every_night() -> None:
+    workflow = yaml.safe_load((WORKFLOWS / 'nightly.yml').read_text())
+    assert workflow[True]['schedule'][0]['cron'].endswith('* * *')  # YAML reads `on` as true
+    assert any('make test-slow' in step.get('run', '') for step in steps_of('nightly'))
+
+
 def test_both_containers_are_built() -> None:
     jobs = yaml.safe_load((WORKFLOWS / 'containers.yml').read_text())['jobs']
     built = {one['file'] for one in jobs['build']['strategy']['matrix']['include']}

@@ -15,7 +15,7 @@ FRAMES = 4
 CONVERT_S = 120
 
 
-@pytest.mark.parametrize('coding', ['raw', 'jpeg'])
+@pytest.mark.parametrize('coding', [pytest.param('raw', marks=pytest.mark.slow), 'jpeg'])
 def test_a_converted_recording_is_tracked_as_it_is_played(make_graph, tmp_path, coding) -> None:
     """Its images are rectified, so they are on image_rect; nobody says so to SLAM."""
     rosbag2 = pytest.importorskip('rosbags.rosbag2')

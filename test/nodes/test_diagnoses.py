@@ -26,7 +26,7 @@ from segfloor_ros.nodes.messages.diagnostics import HEALTH, Health, Level
 from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.topics import IMAGES, TOPICS, best_effort
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-from segfloor_ros.nodes.watches.camera import FIRST_INFO_S
+from segfloor_ros.nodes.watches import camera as camera_watch
 
 CALIBRATION = rectified_calibration(CAMERA)
 GIVEN = (
@@ -156,7 +156,8 @@ def test_eyes_that_are_not_triggered_together_are_named(make_graph, frames) -> N
     assert says(graph, 'stereo_slam', *words, meanwhile=go_on).level is Level.ERROR
 
 
-def test_images_without_calibration_are_named(make_graph, frames) -> None:
+def test_images_without_calibration_are_named(make_graph, frames, monkeypatch) -> None:
+    monkeypatch.setattr(camera_watch, 'FIRST_INFO_S', 1.5)
     graph = make_graph(*GIVEN)
     driver = Driver(graph)
     graph.add(StereoSlamNode())
@@ -166,7 +167,9 @@ def test_images_without_calibration_are_named(make_graph, frames) -> None:
     begin_s = time.monotonic()
     status = says(graph, 'stereo_slam', 'no message on right/camera_info', 'segfloor calibrate')
     assert 'left/camera_info' not in status.message
-    assert time.monotonic() - begin_s > 0.9 * FIRST_INFO_S  # it may come a little later
+    assert (
+        time.monotonic() - begin_s > 0.9 * camera_watch.FIRST_INFO_S
+    )  # it may come a little later
 
 
 def test_images_taken_for_rectified_are_named(make_graph, frames) -> None:
@@ -248,7 +251,7 @@ def test_a_problem_is_logged_when_it_begins_and_when_it_is_over(make_graph) -> N
     graph.tester.create_subscription(Log, '/rosout', take, 100)
     graph.until(lambda: node.count_subscribers('/rosout'), 'the listener to the log')
     for _ in range(3):
-        node.reporter.diagnose('light', 'it is dark; switch the light on')
+        node.reporter.diagnose('light', 'it is dark; switch the light on', lasts_s=1.0)
         graph.comes(lambda: False, 0.3)
     says(graph, 'cloud_labelling', 'it is dark')
     graph.until(lambda: 'over: it is dark' in lines, 'the end')

@@ -193,6 +193,7 @@ def test_a_camera_that_is_too_fast_all_the_time_has_no_more_waiting_than_may() -
     assert set(np.diff(taken[30:])) == {2}, 'one of two, the other is skipped'
 
 
+@pytest.mark.slow
 def test_no_keyframe_is_lost_where_images_come_faster_than_they_are_tracked(tmp_path) -> None:
     """Bursts as of a camera of 30 Hz whose images wait for a core that is busy: what is skipped was
     never a keyframe, and every keyframe comes into the map.

@@ -104,6 +104,7 @@ def wait_until(is_so: Callable[[], bool]) -> None:
         time.sleep(0.1)
 
 
+@pytest.mark.slow
 def test_a_process_that_is_stopped_and_goes_on_ends_nothing(tmp_path) -> None:
     said = tmp_path / 'log'
     with surroundings(), said.open('w') as log:
@@ -122,6 +123,7 @@ def test_a_process_that_is_stopped_and_goes_on_ends_nothing(tmp_path) -> None:
             process.wait()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('victim', ['SLAM', 'the others'])
 def test_when_one_process_is_killed_the_other_one_ends(victim, tmp_path) -> None:
     said = tmp_path / 'log'

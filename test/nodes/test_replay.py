@@ -121,6 +121,7 @@ def test_the_replay_gives_what_the_run_gives(drive, tmp_path) -> None:
     assert 'keyframes that failed: 0' in out
 
 
+@pytest.mark.slow
 def test_a_path_alone_is_that_of_the_run(drive, tmp_path) -> None:
     done = command_line.segfloor('run', drive, '--out', tmp_path / 'run', '--no-map')
     assert done.returncode == 0, done.stderr
@@ -263,6 +264,7 @@ def test_an_interrupt_while_mapping_keeps_the_map(drive, tmp_path, stop) -> None
     assert not any(Path(f'/proc/{pid}').exists() for pid in nodes.values())
 
 
+@pytest.mark.slow
 def test_a_killed_replay_leaves_no_node_and_no_file(drive, tmp_path, monkeypatch) -> None:
     (temporary := tmp_path / 'temporary').mkdir()
     monkeypatch.setenv('TMPDIR', str(temporary))
@@ -288,6 +290,7 @@ def test_a_killed_replay_leaves_no_node_and_no_file(drive, tmp_path, monkeypatch
     assert [path.name for path in (tmp_path / 'out').iterdir()] == ['.segfloor_result']
 
 
+@pytest.mark.slow
 def test_a_node_that_dies_midway_keeps_what_is_mapped(drive, tmp_path) -> None:
     out = tmp_path / 'out'
     replay = start('replay', drive, '--out', out, '--rate', 0.2)

@@ -135,6 +135,7 @@ def test_slam_begun_anew_in_mid_drive_takes_all_nodes_along(make_graph, how) -> 
     assert_same(after, Chain(make_graph).drive(frames[MIDDLE:]))
 
 
+@pytest.mark.slow
 def test_a_mount_that_turns_out_to_be_wrong_has_all_nodes_map_anew(make_graph) -> None:
     """The robot begins before a stage: the map is the one that `run` makes of the same images."""
     stage = Patch((0.2, -2.0, 0.1), (1.2, 0, 0), (0, 4.0, 0), True, contrast=30.0, seed=5)

@@ -128,6 +128,7 @@ def test_the_chain_of_frames_leads_to_the_camera(start, drive) -> None:
         np.testing.assert_allclose(found, T_map_base, atol=0.005)
 
 
+@pytest.mark.slow
 def test_without_publish_tf_nothing_is_broadcast(start, drive) -> None:
     frames, _ = drive
     chain = start(publish_tf='false')
@@ -171,6 +172,7 @@ def test_a_mount_on_tf_is_that_of_the_parameters(start, drive) -> None:
     np.testing.assert_allclose(poses[1], poses[0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_without_tf_the_wait_ends_and_the_mount_is_measured(start, drive) -> None:
     frames, _ = drive
     chain = start(**WITHOUT_MOUNT, tf_wait_s=1.0)
@@ -183,6 +185,7 @@ def test_without_tf_the_wait_ends_and_the_mount_is_measured(start, drive) -> Non
     assert chain.log(SLAM).count(f'no tf from base_link to {CAMERA_FRAME} within 1 s') == 1
 
 
+@pytest.mark.slow
 def test_a_camera_that_hangs_on_its_body_is_put_on_the_base_with_it(start, drive) -> None:
     """The optical frame has a parent already; a second one would tear the tree apart."""
     frames, _ = drive
