@@ -1,10 +1,11 @@
-"""Messages of one keyframe for the nodes behind SLAM, and how they are sent."""
+"""Messages of a camera and of one keyframe for the nodes, and how they are sent."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.core.contracts import (
     POINT_FLOOR,
@@ -14,8 +15,10 @@ from segfloor_ros.core.contracts import (
     KeyframePath,
     LabelledPoints,
     SparseCloud,
+    StereoFrame,
 )
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.odometry import odometry_message
 from segfloor_ros.nodes.messages.points import (
@@ -26,6 +29,14 @@ from segfloor_ros.nodes.messages.points import (
 from segfloor_ros.nodes.messages.poses import PathMessages
 from segfloor_ros.nodes.messages.scans import scan_message
 
+CALIBRATION = rectified_calibration(CAMERA)
+SIDES = ('left', 'right')
+INPUTS = tuple(f'{side}/{what}' for side in SIDES for what in ('camera_info', 'image_raw'))
+MOUNTED = (
+    '-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
+    '-p', f'camera_roll_rad:={MOUNT.roll_rad}',
+)  # fmt: skip
+"""The mount of the camera as arguments of a node."""
 STAMP_NS = 12_345_678_901
 AT_ORIGIN = np.eye(4)
 POINTS = SparseCloud(
@@ -44,6 +55,16 @@ LABELLED = LabelledPoints(
     np.ones(2, np.float32),
 )
 SCAN = FloorScan(-0.5, 0.25, np.array([1.5, 1.5, 1.5, 1.5, 1.5], np.float32))
+
+
+def stereo_messages(frame: StereoFrame, sides: tuple[str, ...] = SIDES) -> dict[str, Any]:
+    """Return images and calibrations of a frame by topic; their frames are called as the sides."""
+    messages: dict[str, Any] = {}
+    for side in sides:
+        at = frame.stamp_ns, side
+        messages[f'{side}/camera_info'] = camera_info_message(*at, getattr(CALIBRATION, side))
+        messages[f'{side}/image_raw'] = image_message(*at, getattr(frame, side))
+    return messages
 
 
 def cloud_messages(stamp_ns: int) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from node_messages import cloud_messages, publish
+from node_messages import CALIBRATION, MOUNTED, cloud_messages, publish
 from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -21,18 +21,13 @@ from stereo_room import CAMERA, MOUNT
 from segfloor_ros.core.floor.plane.mount import MountEstimator
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message
 from segfloor_ros.nodes.messages.diagnostics import HEALTH, Health, Level
 from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.topics import IMAGES, TOPICS, best_effort
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 from segfloor_ros.nodes.watches import camera as camera_watch
 
-CALIBRATION = rectified_calibration(CAMERA)
-GIVEN = (
-    '-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
-    '-p', 'camera_roll_rad:=0.0',
-)  # fmt: skip
 FRAME_NS = 100_000_000
 
 
@@ -86,7 +81,7 @@ class Driver:
 
 
 def test_images_offered_best_effort_are_named_and_taken_by_parameter(make_graph, frames) -> None:
-    graph = make_graph(*GIVEN, '-p', 'image_reliability:=reliable')
+    graph = make_graph(*MOUNTED, '-p', 'image_reliability:=reliable')
     driver = Driver(graph, profile=best_effort(IMAGES))
     graph.add(StereoSlamNode())
     words = ('/left/image_raw', '/tester', 'best effort', 'stereo_slam.image_reliability')
@@ -95,7 +90,7 @@ def test_images_offered_best_effort_are_named_and_taken_by_parameter(make_graph,
     assert '/right/camera_info' in status.message
     del driver
     graph.close()
-    graph = make_graph(*GIVEN, '-p', 'image_reliability:=best_effort')
+    graph = make_graph(*MOUNTED, '-p', 'image_reliability:=best_effort')
     driver = Driver(graph, profile=best_effort(IMAGES))
     graph.add(StereoSlamNode())
     driver.connect()
@@ -109,7 +104,7 @@ def test_images_offered_best_effort_are_named_and_taken_by_parameter(make_graph,
 def test_images_offered_best_effort_are_taken_as_that_by_themselves(
     make_graph, frames, comes_first
 ) -> None:
-    graph = make_graph(*GIVEN)
+    graph = make_graph(*MOUNTED)
     driver = Driver(graph, profile=best_effort(IMAGES)) if comes_first == 'driver' else None
     node = graph.add(StereoSlamNode())
     says(graph, 'stereo_slam', '')
@@ -134,7 +129,7 @@ def test_a_listener_that_asks_for_more_than_is_offered_is_named(make_graph) -> N
 
 
 def test_eyes_that_are_not_triggered_together_are_named(make_graph, frames) -> None:
-    graph = make_graph(*GIVEN)
+    graph = make_graph(*MOUNTED)
     driver = Driver(graph)
     graph.add(StereoSlamNode())
     driver.connect()
@@ -158,7 +153,7 @@ def test_eyes_that_are_not_triggered_together_are_named(make_graph, frames) -> N
 
 def test_images_without_calibration_are_named(make_graph, frames, monkeypatch) -> None:
     monkeypatch.setattr(camera_watch, 'FIRST_INFO_S', 1.5)
-    graph = make_graph(*GIVEN)
+    graph = make_graph(*MOUNTED)
     driver = Driver(graph)
     graph.add(StereoSlamNode())
     driver.connect()
@@ -173,7 +168,7 @@ def test_images_without_calibration_are_named(make_graph, frames, monkeypatch) -
 
 
 def test_images_taken_for_rectified_are_named(make_graph, frames) -> None:
-    graph = make_graph(*GIVEN, '-p', 'image_kind:=rect')
+    graph = make_graph(*MOUNTED, '-p', 'image_kind:=rect')
     driver = Driver(graph, image='image_rect')
     graph.add(StereoSlamNode())
     driver.connect()
@@ -188,7 +183,7 @@ def test_images_taken_for_rectified_are_named(make_graph, frames) -> None:
 
 
 def test_a_camera_that_was_unplugged_is_named(make_graph, frames) -> None:
-    graph = make_graph(*GIVEN)
+    graph = make_graph(*MOUNTED)
     driver = Driver(graph)
     graph.add(StereoSlamNode())
     driver.connect()
@@ -201,7 +196,7 @@ def test_a_camera_that_was_unplugged_is_named(make_graph, frames) -> None:
 
 def test_a_mount_that_the_floor_contradicts_is_named_with_both_numbers(make_graph, frames) -> None:
     """The camera looks down by 0.15 rad = 8.6 deg; the parameters say 14.3 deg."""
-    wrong = (*GIVEN[:3], 'camera_pitch_rad:=0.25', *GIVEN[4:])
+    wrong = (*MOUNTED[:3], 'camera_pitch_rad:=0.25', *MOUNTED[4:])
     wrong += ('-p', 'image_reliability:=best_effort', '-p', 'keyframe_max_frames:=1')
     graph = make_graph(*wrong)
     driver = Driver(graph, profile=best_effort(IMAGES))

@@ -3,34 +3,24 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import pytest
-from node_messages import cloud_messages, publish
+from node_messages import CALIBRATION, INPUTS, MOUNTED, cloud_messages, publish, stereo_messages
 from rclpy.node import Node
 from ros_graph import another_participant
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image
 from stereo_drive import room_drive
-from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.messages.camera_infos import (
-    camera_info_message,
-    compressed_message,
-    rectified_calibration,
-)
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message, compressed_message
 from segfloor_ros.nodes.messages.diagnostics import HEALTH, Level
 from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.topics import FRAMES, IMAGES, SLAM, TOPICS, to_time
 from segfloor_ros.nodes.shared import reporter
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 from segfloor_ros.nodes.watches.lookalikes import likeness
-
-GIVEN = (
-    '-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
-    '-p', 'camera_roll_rad:=0.0',
-)  # fmt: skip
-CALIBRATION = rectified_calibration(CAMERA)
 
 
 @pytest.fixture
@@ -54,7 +44,7 @@ def console(monkeypatch):
 )
 def test_slam_takes_the_images_that_are_published(make_graph, kind) -> None:
     (frame, *_), _ = room_drive(1)
-    graph = make_graph(*GIVEN)
+    graph = make_graph(*MOUNTED)
     node = graph.add(StereoSlamNode())
     names = [f'{side}/{what}' for side in ('left', 'right') for what in (kind, 'camera_info')]
     publishers = {name: graph.publisher(name) for name in names}
@@ -76,7 +66,7 @@ def test_slam_takes_the_images_that_are_published(make_graph, kind) -> None:
 
 
 def test_raw_images_come_first_and_an_explicit_choice_holds(make_graph) -> None:
-    graph = make_graph(*GIVEN, '-p', 'image_kind:=rect')
+    graph = make_graph(*MOUNTED, '-p', 'image_kind:=rect')
     for kind in ('image_raw', 'image_rect'):
         for side in ('left', 'right'):
             graph.publisher(f'{side}/{kind}')
@@ -86,7 +76,7 @@ def test_raw_images_come_first_and_an_explicit_choice_holds(make_graph) -> None:
     assert node.count_subscribers('left/image_rect') == 1
     assert node.count_subscribers('left/image_raw') == 0
     graph.close()
-    graph = make_graph(*GIVEN)
+    graph = make_graph(*MOUNTED)
     for kind in ('image_rect', 'image_raw'):
         for side in ('left', 'right'):
             graph.publisher(f'{side}/{kind}')
@@ -170,7 +160,7 @@ def test_parts_that_are_missing_at_the_start_are_counted_and_not_logged(
 
 def test_one_camera_alone_is_declined_in_one_line_that_says_why(make_graph, console) -> None:
     frames, _ = room_drive(12)
-    graph = make_graph(*GIVEN)
+    graph = make_graph(*MOUNTED)
     graph.add(StereoSlamNode())
     with another_participant() as driver:
         left = driver.create_publisher(Image, '/left/image_raw', IMAGES)
@@ -215,13 +205,10 @@ def test_a_node_of_the_same_name_is_named(make_graph, console) -> None:
 def test_after_a_bag_has_ended_nobody_asks_for_the_camera(make_graph, console) -> None:
     """Its player publishes no time any more, and the images are as old as they were."""
     (frame, *_), _ = room_drive(1)
-    graph = make_graph(*GIVEN, '-p', 'use_sim_time:=true')
+    graph = make_graph(*MOUNTED, '-p', 'use_sim_time:=true')
     node = graph.add(StereoSlamNode())
     clock = graph.tester.create_publisher(Clock, '/clock', FRAMES)
-    names = [
-        f'{side}/{what}' for side in ('left', 'right') for what in ('image_raw', 'camera_info')
-    ]
-    publishers = {name: graph.publisher(name) for name in names}
+    publishers = {name: graph.publisher(name) for name in INPUTS}
     graph.connected([clock, *publishers.values()])
     stamp_ns = 1_000_000_000_000
 
@@ -230,11 +217,7 @@ def test_after_a_bag_has_ended_nobody_asks_for_the_camera(make_graph, console) -
         return node.get_clock().now().nanoseconds == stamp_ns
 
     graph.until(told_the_time, 'the time of the recording')
-    for side in ('left', 'right'):
-        info = camera_info_message(stamp_ns, side, getattr(CALIBRATION, side))
-        publishers[f'{side}/camera_info'].publish(info)
-        image = image_message(stamp_ns, side, getattr(frame, side))
-        publishers[f'{side}/image_raw'].publish(image)
+    publish(graph, stereo_messages(replace(frame, stamp_ns=stamp_ns)), publishers)
     graph.until(lambda: graph.reports('stereo_slam'), 'the answer')
     assert not graph.comes(lambda: any('connected' in text for _, text in console), 5.0)
 

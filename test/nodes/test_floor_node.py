@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 import numpy as np
-from node_messages import AT_ORIGIN, STAMP_NS, pose_message_at, publish
+from node_messages import AT_ORIGIN, STAMP_NS, pose_message_at, publish, stereo_messages
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
+from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.floor.pictures import mask_overlay
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
-from segfloor_ros.nodes.messages.images import grey8_image, image_message
+from segfloor_ros.nodes.messages.images import grey8_image
 from segfloor_ros.nodes.messages.poses import transform_message
 from segfloor_ros.nodes.messages.scans import scan_arrays
 from segfloor_ros.nodes.messages.topics import to_ns
-
-CALIBRATION = rectified_calibration(CAMERA)
 
 
 def keyframe_messages(stamp_ns: int, left, right, T_map_base=AT_ORIGIN) -> dict:
     """Return what `floor_segmentation` needs of one keyframe."""
     messages = {'keyframe/odometry': pose_message_at(stamp_ns, T_map_base)}
-    for side, image in (('left', left), ('right', right)):
-        messages[f'keyframe/{side}/image_rect'] = image_message(stamp_ns, side, image)
-        info = camera_info_message(stamp_ns, side, getattr(CALIBRATION, side))
-        messages[f'keyframe/{side}/camera_info'] = info
+    for topic, message in stereo_messages(StereoFrame(0, stamp_ns, left, right)).items():
+        messages[f'keyframe/{topic.replace("image_raw", "image_rect")}'] = message
     return messages
 
 

@@ -8,27 +8,21 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from node_messages import CALIBRATION, MOUNTED, SIDES
 from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter
 from stereo_drive import room_drive
-from stereo_room import CAMERA, MOUNT
+from stereo_room import MOUNT
 
 from segfloor_ros.core.geometry import R_ROS_OPTICAL, make_transform
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.configuration import unread_sections
-from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message
 from segfloor_ros.nodes.messages.diagnostics import HEALTH, Level
 from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.poses import transform_message
 from segfloor_ros.nodes.messages.topics import IMAGES, KEYFRAMES, LATCHED, TOPICS
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-
-CALIBRATION = rectified_calibration(CAMERA)
-GIVEN = (
-    '-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
-    '-p', 'camera_roll_rad:=0.0',
-)  # fmt: skip
-SIDES = ('left', 'right')
 
 
 @pytest.fixture(scope='module')
@@ -140,7 +134,7 @@ def health_says(graph, *words: str):
 def test_a_frame_with_two_parents_is_an_error_with_names_and_remedy(
     make_graph, frames, rival
 ) -> None:
-    graph = make_graph(*GIVEN, '-p', 'tf_wait_s:=0.2')
+    graph = make_graph(*MOUNTED, '-p', 'tf_wait_s:=0.2')
     tf, rig = tf_publishers(graph), Rig(graph)
     graph.add(StereoSlamNode())
     rig.connect()
@@ -171,7 +165,7 @@ def test_a_frame_with_two_parents_is_an_error_with_names_and_remedy(
 
 
 def test_what_the_node_broadcasts_itself_is_no_rival(make_graph, frames) -> None:
-    graph = make_graph(*GIVEN, '-p', 'tf_wait_s:=0.2')
+    graph = make_graph(*MOUNTED, '-p', 'tf_wait_s:=0.2')
     tf, rig = tf_publishers(graph), Rig(graph)
     tf.fix('base_link', 'lidar', at(0.2, np.eye(3)))
     graph.add(StereoSlamNode())
@@ -184,7 +178,7 @@ def test_what_the_node_broadcasts_itself_is_no_rival(make_graph, frames) -> None
 
 
 def test_a_calibration_that_was_published_once_before_is_taken(make_graph, frames) -> None:
-    graph = make_graph(*GIVEN)
+    graph = make_graph(*MOUNTED)
     rig = Rig(graph, LATCHED)
     rig.send_infos()
     graph.add(StereoSlamNode())
@@ -202,7 +196,7 @@ def test_a_calibration_that_was_published_once_before_is_taken(make_graph, frame
 
 @pytest.mark.parametrize(('late_frames', 'apart_ms', 'is_said'), [(40, 0, False), (0, 15, True)])
 def test_a_side_that_arrives_late_is_not_apart(make_graph, late_frames, apart_ms, is_said) -> None:
-    node = make_graph(*GIVEN).add(StereoSlamNode())
+    node = make_graph(*MOUNTED).add(StereoSlamNode())
     watch = node._camera.watch
     watch.expect('left/image_raw', 'right/image_raw')
     for number in range(100):

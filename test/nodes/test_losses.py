@@ -8,28 +8,19 @@ import time
 import numpy as np
 import pytest
 from node_chain import CHAIN, NodeChain
-from node_messages import cloud_messages, publish
+from node_messages import INPUTS, MOUNTED, cloud_messages, publish, stereo_messages
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_graph import fresh_graph
 from std_srvs.srv import SetBool
 from stereo_drive import room_drive
-from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import HEALTH, LASTS_S, Level
-from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.topics import IMAGES, KEYFRAMES, PROFILES, TOPICS
 from segfloor_ros.nodes.shared.joining import StampJoiner
 from segfloor_ros.nodes.shared.reporter import LossCounter, loss_in_words, loss_level
 from segfloor_ros.nodes.slam_camera import PairQueue
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-
-GIVEN = (
-    '-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
-    '-p', 'camera_roll_rad:=0.0',
-)  # fmt: skip
-CALIBRATION = rectified_calibration(CAMERA)
 
 
 def health(graph, node: str):
@@ -133,27 +124,23 @@ def test_frames_that_come_faster_than_they_are_tracked_are_skipped_and_said(
     wait for their calibration are kept.
     """
     frames, _ = room_drive(12, step_m=0.01)
-    graph = make_graph(*GIVEN)
+    graph = make_graph(*MOUNTED)
     graph.add(StereoSlamNode())
-    inputs = {
-        name: graph.publisher(name)
-        for name in ('left/image_raw', 'right/image_raw', 'left/camera_info', 'right/camera_info')
-    }
+    inputs = {name: graph.publisher(name) for name in INPUTS}
     graph.connected(list(inputs.values()))
+
+    def send(frame, is_wanted=lambda name: True) -> None:
+        for name, message in stereo_messages(frame).items():
+            if is_wanted(name):
+                inputs[name].publish(message)
+
     for frame in frames:
-        for side in ('left', 'right'):
-            info = camera_info_message(frame.stamp_ns, side, getattr(CALIBRATION, side))
-            if not before_calibration:
-                inputs[f'{side}/camera_info'].publish(info)
-            image = image_message(frame.stamp_ns, side, getattr(frame, side))
-            inputs[f'{side}/image_raw'].publish(image)
+        send(frame, lambda name: not (before_calibration and name.endswith('camera_info')))
         if frame.index == 0 and not before_calibration:
             graph.until(lambda: graph.reports('stereo_slam'), 'the first answer')
     if before_calibration:
         graph.comes(lambda: False, 0.5)
-        for side in ('left', 'right'):
-            info = camera_info_message(frames[0].stamp_ns, side, getattr(CALIBRATION, side))
-            inputs[f'{side}/camera_info'].publish(info)
+        send(frames[0], lambda name: name.endswith('camera_info'))
     graph.until(lambda: len(graph.reports('stereo_slam')) == len(frames), 'all answers')
     by_stamp = {s.stamp_ns: s for s in graph.reports('stereo_slam')}
     taken = [f.index for f in frames if 'skipped' not in by_stamp[f.stamp_ns].message]

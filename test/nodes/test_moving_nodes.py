@@ -7,7 +7,16 @@ from types import SimpleNamespace
 
 import numpy as np
 from moving_drive import MovingDrive
-from node_messages import AT_ORIGIN, SCAN, STAMP_NS, pose_message_at, publish
+from node_messages import (
+    AT_ORIGIN,
+    CALIBRATION,
+    MOUNTED,
+    SCAN,
+    STAMP_NS,
+    pose_message_at,
+    publish,
+    stereo_messages,
+)
 from stereo_room import CAMERA, MOUNT, planar_pose
 
 from segfloor_ros.apps.cli.explore_session import Pilot
@@ -18,7 +27,6 @@ from segfloor_ros.core.camera.rectification import StereoRectifier
 from segfloor_ros.core.contracts import FLOOR, MovingPoints, SparseCloud
 from segfloor_ros.core.slam.tracking.images import is_inside
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import Level, Status
 from segfloor_ros.nodes.messages.images import grey8_image, image_message
 from segfloor_ros.nodes.messages.odometry import odometry_message, pose_with_covariance_message
@@ -35,29 +43,14 @@ from segfloor_ros.nodes.messages.topics import to_ns
 from segfloor_ros.nodes.slam_sensors import MaskInput
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
-CALIBRATION = rectified_calibration(CAMERA)
-ARGUMENTS = (
-    '-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
-    '-p', 'camera_roll_rad:=0.0',
-)  # fmt: skip
-
 
 def crossing(index):
     return (0.03 * index + 1.6, -1.0 + 0.05 * index)
 
 
-def stereo_messages(frame):
-    messages = {}
-    for side in ('left', 'right'):
-        eye, image = getattr(CALIBRATION, side), getattr(frame, side)
-        messages[f'{side}/camera_info'] = camera_info_message(frame.stamp_ns, side, eye)
-        messages[f'{side}/image_raw'] = image_message(frame.stamp_ns, side, image)
-    return messages
-
-
 def test_masks_on_dynamic_mask_keep_features_out_and_come_back_with_the_keyframe(make_graph):
     drive = MovingDrive(crossing)
-    graph = make_graph(*ARGUMENTS, '-p', 'detect_moving:=false', '-p', 'mask_timeout_s:=0.0')
+    graph = make_graph(*MOUNTED, '-p', 'detect_moving:=false', '-p', 'mask_timeout_s:=0.0')
     features, masks = graph.collect('keyframe/features'), graph.collect('keyframe/moving_mask')
     node = graph.add(StereoSlamNode())
     inputs: dict = {}
@@ -87,7 +80,7 @@ def test_masks_on_dynamic_mask_keep_features_out_and_come_back_with_the_keyframe
 
 def test_moving_points_tell_what_crosses_and_diagnostics_count_it(make_graph):
     drive = MovingDrive(lambda index: crossing(index - 8) if index >= 8 else None)
-    graph = make_graph(*ARGUMENTS)
+    graph = make_graph(*MOUNTED)
     clouds = graph.collect('moving_points')
     graph.add(StereoSlamNode())
     inputs: dict = {}

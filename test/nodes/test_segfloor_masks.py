@@ -8,7 +8,8 @@ import time
 import numpy as np
 import pytest
 from moving_drive import MovingDrive
-from node_messages import publish
+from node_messages import CALIBRATION, publish, stereo_messages
+from node_messages import MOUNTED as GIVEN
 from small_network import constant_network, grey_network
 from stereo_room import CAMERA, MOUNT
 
@@ -24,7 +25,7 @@ from segfloor_ros.core.contracts import (
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.grid.occupancy import FREE, UNKNOWN, OccupancyGrid
 from segfloor_ros.core.slam.tracking.images import is_inside
-from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
+from segfloor_ros.nodes.messages.camera_infos import camera_info_message
 from segfloor_ros.nodes.messages.grids import grid_message, grid_of
 from segfloor_ros.nodes.messages.images import disparity_message, grey8_image, image_message
 from segfloor_ros.nodes.messages.points import features_message
@@ -34,11 +35,7 @@ from segfloor_ros.nodes.messages.topics import to_ns
 from segfloor_ros.nodes.segfloor_masks import SegfloorMasksNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
-CALIBRATION = rectified_calibration(CAMERA)
-MOUNTED = (
-    '-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
-    '-p', 'camera_roll_rad:=0.0', '-p', 'detect_moving:=false', '-p', 'background:=false',
-)  # fmt: skip
+MOUNTED = (*GIVEN, '-p', 'detect_moving:=false', '-p', 'background:=false')
 
 
 def image(stamp_ns, dark_columns=30):
@@ -111,12 +108,7 @@ def test_a_mask_that_comes_after_its_keyframe_takes_its_points_back(make_graph):
     inputs: dict = {}
     for index in range(2):
         frame = drive.frame(index)
-        messages = {}
-        for side in ('left', 'right'):
-            eye, picture = getattr(CALIBRATION, side), getattr(frame, side)
-            messages[f'{side}/camera_info'] = camera_info_message(frame.stamp_ns, side, eye)
-            messages[f'{side}/image_raw'] = image_message(frame.stamp_ns, side, picture)
-        inputs = publish(graph, messages, inputs)
+        inputs = publish(graph, stereo_messages(frame), inputs)
         graph.until(lambda: features, 'the keyframe')
         if index == 0:
             keyframe = node.slam.map.keyframes[0]

@@ -10,16 +10,20 @@ import pytest
 from floor_scenes import SMALL_CAMERA, blank_floored, box
 from node_messages import (
     FEATURES,
+    INPUTS,
     LABELLED,
     MASK,
+    MOUNTED,
     POINTS,
     SCAN,
+    SIDES,
     STAMP_NS,
     cloud_messages,
     grid_arrays,
     grid_messages,
     pose_message_at,
     publish,
+    stereo_messages,
 )
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
@@ -68,8 +72,6 @@ from segfloor_ros.nodes.messages.scans import free_ranges, near_obstacles
 from segfloor_ros.nodes.messages.topics import to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-
-CALIBRATION = rectified_calibration(CAMERA)
 
 
 def test_the_camera_sends_every_pair_as_recorded(make_graph, tmp_path) -> None:
@@ -129,28 +131,18 @@ def test_the_camera_compresses_as_it_is_told(make_graph, tmp_path) -> None:
 class TestStereoSlam:
     """The node `stereo_slam` fed by hand."""
 
-    ARGUMENTS = (
-        '-p', f'camera_height_m:={MOUNT.height_m}',
-        '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
-        '-p', 'camera_roll_rad:=0.0',
-    )  # fmt: skip
-
     def inputs(self, graph):
-        names = ('left/image_raw', 'right/image_raw', 'left/camera_info', 'right/camera_info')
-        publishers = {name: graph.publisher(name) for name in names}
+        publishers = {name: graph.publisher(name) for name in INPUTS}
         graph.connected(list(publishers.values()))
         return publishers
 
-    def send(self, inputs, frame, sides=('left', 'right')) -> None:
-        for side in sides:
-            eye, image = getattr(CALIBRATION, side), getattr(frame, side)
-            info = camera_info_message(frame.stamp_ns, side, eye)
-            inputs[f'{side}/camera_info'].publish(info)
-            inputs[f'{side}/image_raw'].publish(image_message(frame.stamp_ns, side, image))
+    def send(self, inputs, frame, sides=SIDES) -> None:
+        for name, message in stereo_messages(frame, sides).items():
+            inputs[name].publish(message)
 
     def test_it_tracks_and_everything_of_a_keyframe_has_its_stamp(self, make_graph) -> None:
         frames, truth = room_drive(8)
-        graph = make_graph(*self.ARGUMENTS)
+        graph = make_graph(*MOUNTED)
         names = (
             'odometry', 'keyframe/odometry', 'keyframe/left/image_rect', 'map_points',
             'keyframe/right/image_rect', 'keyframe/left/camera_info', 'keyframe/features',
@@ -237,7 +229,7 @@ class TestStereoSlam:
 
     def test_the_mount_reaches_those_who_come_late(self, make_graph) -> None:
         frames, _ = room_drive(1)
-        graph = make_graph(*self.ARGUMENTS)
+        graph = make_graph(*MOUNTED)
         graph.add(StereoSlamNode())
         self.send(self.inputs(graph), frames[0])
         graph.until(lambda: graph.reports('stereo_slam'), 'the answer')
@@ -250,7 +242,7 @@ class TestStereoSlam:
     def test_when_lost_it_says_so_and_publishes_no_pose(self, make_graph) -> None:
         frames, _ = room_drive(2)
         dark = np.zeros_like(frames[0].left)
-        graph = make_graph(*self.ARGUMENTS)
+        graph = make_graph(*MOUNTED)
         poses = graph.collect('odometry')
         graph.add(StereoSlamNode())
         inputs = self.inputs(graph)
@@ -267,7 +259,7 @@ class TestStereoSlam:
 
     def test_broken_and_lonely_images_are_named_and_the_node_lives(self, make_graph) -> None:
         frames, _ = room_drive(4)
-        graph = make_graph(*self.ARGUMENTS)
+        graph = make_graph(*MOUNTED)
         graph.add(StereoSlamNode())
         inputs = self.inputs(graph)
         self.send(inputs, frames[0])
@@ -410,14 +402,10 @@ class TestFrameScan:
     """The scan of every tracked frame."""
 
     def frame_messages(self, frame):
-        messages = {}
-        for side in ('left', 'right'):
-            eye = getattr(CALIBRATION, side)
-            info = camera_info_message(frame.stamp_ns, side, eye)
-            messages[f'frame/{side}/camera_info'] = info
-            image = image_message(frame.stamp_ns, side, getattr(frame, side))
-            messages[f'frame/{side}/image_rect'] = image
-        return messages
+        return {
+            f'frame/{topic.replace("image_raw", "image_rect")}': message
+            for topic, message in stereo_messages(frame).items()
+        }
 
     def test_it_is_that_of_the_stage(self, make_graph) -> None:
         (frame, *_), _ = room_drive(1)
@@ -475,7 +463,7 @@ class TestFrameScan:
 
     def test_slam_sends_every_tracked_frame_to_whoever_listens(self, make_graph) -> None:
         frames, _ = room_drive(4)
-        graph = make_graph(*TestStereoSlam.ARGUMENTS)
+        graph = make_graph(*MOUNTED)
         received = {name: graph.collect(name) for name in self.frame_messages(frames[0])}
         graph.add(StereoSlamNode())
         slam = TestStereoSlam()
@@ -497,7 +485,7 @@ class TestFrameScan:
     ) -> None:
         frames, _ = room_drive(7, step_m=0.02)
         frames = [replace(frame, stamp_ns=frame.index * 10**9 // 30) for frame in frames]
-        graph = make_graph(*TestStereoSlam.ARGUMENTS)
+        graph = make_graph(*MOUNTED)
         small = graph.collect('frame/left/image_rect')
         node = graph.add(StereoSlamNode())
         slam = TestStereoSlam()

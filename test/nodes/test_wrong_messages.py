@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -110,34 +112,30 @@ def test_an_initial_pose_with_a_covariance_that_is_no_number_is_refused(chain, f
     assert [a.values['tracked'] for a in chain.drive(frames[:4])] == ['1'] * 4
 
 
-@pytest.mark.parametrize(
-    ('node', 'parameter', 'service'),
-    [
-        ('stereo_slam', 'save_map', 'stereo_slam/save_map'),
-        ('stereo_slam', 'save_map', 'stereo_slam/prune_map'),
-        ('stereo_slam', 'load_map', 'stereo_slam/load_map'),
-        ('occupancy_grid', 'map_file', 'save_map'),
-    ],
+FILES_BY = (
+    ('stereo_slam', 'save_map', 'stereo_slam/save_map'),
+    ('stereo_slam', 'save_map', 'stereo_slam/prune_map'),
+    ('stereo_slam', 'load_map', 'stereo_slam/load_map'),
+    ('occupancy_grid', 'map_file', 'save_map'),
 )
-@pytest.mark.parametrize(
-    'name', ['~nosuchuser/x.map', 'a' * 300, '/dev/null/x', '/proc/x', 'photo']
-)
-def test_no_name_of_a_file_ends_a_node(
-    chain, frames, tmp_path, monkeypatch, node, parameter, service, name
-) -> None:
+"""Node, parameter and service that read or write a file."""
+MINE = dict.fromkeys(('photo', 'photo.yaml', 'photo.pgm'), 'mine')
+
+
+def test_no_name_of_a_file_ends_a_node(chain, frames, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    for photo in ('photo', 'photo.yaml', 'photo.pgm'):
-        (tmp_path / photo).write_text('mine')
+    for photo, content in MINE.items():
+        (tmp_path / photo).write_text(content)
     answers = chain.drive(frames[:6])
     chain.mapped(last_keyframe(answers))
-    chain.set(node, parameter, name)
-    answer = chain.graph.call(Trigger, service, Trigger.Request())
-    assert (answer.success, answer.message.count('\n')) == (False, 0)
-    assert name[:40] in answer.message
-    answer = chain.graph.call(Trigger, 'stereo_slam/map_info', Trigger.Request())
-    assert answer.success
-    found = {path.name: path.read_text() for path in tmp_path.iterdir()}
-    assert found == dict.fromkeys(('photo', 'photo.yaml', 'photo.pgm'), 'mine')
+    names = ('~nosuchuser/x.map', 'a' * 300, '/dev/null/x', '/proc/x', 'photo')
+    for (node, parameter, service), name in itertools.product(FILES_BY, names):
+        chain.set(node, parameter, name)
+        answer = chain.graph.call(Trigger, service, Trigger.Request())
+        assert (answer.success, answer.message.count('\n')) == (False, 0), (service, name)
+        assert name[:40] in answer.message, service
+        assert chain.graph.call(Trigger, 'stereo_slam/map_info', Trigger.Request()).success
+        assert {path.name: path.read_text() for path in tmp_path.iterdir()} == MINE
 
 
 def test_what_a_service_raises_is_its_answer(chain, frames, monkeypatch) -> None:
