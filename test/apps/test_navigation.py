@@ -338,6 +338,7 @@ def test_it_explores_both_rooms_then_drives_to_its_goals_and_touches_nothing() -
     assert drive.nearest_m > BODY.radius_m - CELL_M / 2
 
 
+@pytest.mark.slow
 def test_goals_that_are_given_are_driven_to_in_their_order_and_one_in_a_wall_is_given_up() -> None:
     goals = [Goal(np.array([2.0, 0.8]), 'desk'), Goal(np.array([1.35, 0.95]), 'wall')]
     drive = Drive(grid_of(TWO_ROOMS), Explorer(BODY, goals), np.array([0.6, 0.55, 0.0]))
@@ -421,6 +422,7 @@ def test_a_door_that_shuts_is_driven_around() -> None:
     assert drive.nearest_m > BODY.radius_m - CELL_M  # as finely as the map is
 
 
+@pytest.mark.slow
 def test_a_goal_behind_a_shut_door_is_driven_to_after_the_others_once_that_is_open_again() -> None:
     truth = grid_of(DOORS)
     goals = [Goal(np.array([2.0, 0.4]), 'behind'), Goal(np.array([0.35, 0.9]), 'here')]

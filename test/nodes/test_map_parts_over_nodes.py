@@ -49,6 +49,7 @@ def test_more_held_results_than_a_queue_holds_arrive(make_graph, tmp_path) -> No
     assert 10 < len(lost) < len(poses) - len(KNOWN) - len(ON) - QUEUE
 
 
+@pytest.mark.slow
 def test_what_was_held_back_does_not_delay_what_is_newest(make_graph) -> None:
     """Tracking leaves the node no time for anything else: results go out all the same."""
     room = StereoRoom()

@@ -284,6 +284,7 @@ def test_load_map_takes_all_nodes_to_another_map(saved, drive, make_graph, tmp_p
     )
 
 
+@pytest.mark.slow
 def test_a_map_that_was_not_recognised_is_not_overwritten(saved, loaded) -> None:
     before = saved[0].read_bytes()
     chain, transforms = loaded(), []

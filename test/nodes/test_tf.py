@@ -206,6 +206,7 @@ def test_a_camera_that_hangs_on_its_body_is_put_on_the_base_with_it(start, drive
     np.testing.assert_allclose(found, MOUNT.T_base_left, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_odometry_of_another_node_is_corrected(start, drive) -> None:
     """The other node's odometry starts elsewhere and drifts; at the times of the images, over both
     links, the base is where SLAM has it.

@@ -77,6 +77,7 @@ def kill_slam_once_busy(busy_s: float) -> threading.Thread:
     return thread
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_robot_maps_a_chamber_and_drives_to_a_goal(tmp_path) -> None:
     scene, out = tmp_path / 'chamber.yaml', tmp_path / 'out'

@@ -159,6 +159,7 @@ def test_what_cannot_be_written_is_said_before_the_first_frame(drive, tmp_path, 
     assert (tmp_path / 'photo.map').read_text() == 'mine'
 
 
+@pytest.mark.slow
 def test_files_that_cannot_be_written_late_are_elsewhere(drive, whole, tmp_path):
     """As on a disk that is full: no file may be larger than the summary is."""
     elsewhere, saved = tmp_path / 'elsewhere', tmp_path / 'room.map'
@@ -189,6 +190,7 @@ def test_files_that_cannot_be_written_late_are_elsewhere(drive, whole, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {'elsewhere', 'out'}
 
 
+@pytest.mark.slow
 def test_a_frame_and_a_keyframe_at_which_a_stage_fails_are_lost_alone(drive, tmp_path, monkeypatch):
     process_frame, process_floor = StereoSlam.process, FloorSegmentation.process
     failed = []
@@ -237,6 +239,7 @@ def recorded(drive: Path, bag: Path, spoil: bool) -> Path:
     return bag
 
 
+@pytest.mark.slow
 def test_messages_that_hold_no_numbers_are_dropped_and_counted(drive, tmp_path):
     paths = []
     for spoil in (False, True):

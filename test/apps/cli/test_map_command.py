@@ -70,6 +70,7 @@ def paths(saved, count):
     return (poses[:count], frames[:count]), (poses[count:], frames[count:])
 
 
+@pytest.mark.slow
 def test_a_map_that_is_merged_is_straightened_and_said_to_be_bent(first, tmp_path, caplog):
     bent = first.slam['keyframe_T_camera_world'].copy()
     bent[:, :3, 0] *= 1.05
@@ -156,6 +157,7 @@ def with_post(saved, xy_m):
     return SavedMap('later.map', replace(saved.file, parts=parts))
 
 
+@pytest.mark.slow
 def test_what_has_come_and_what_has_gone(first):
     xy_m = np.array([2.0, 0.2])
     later = with_post(first, xy_m)
@@ -208,6 +210,7 @@ def test_stages_agree_on_what_is_left_of_a_pruned_map(merged):
     np.testing.assert_array_equal(slam['point_xyz_world'], merged.slam['point_xyz_world'][row])
 
 
+@pytest.mark.slow
 def test_what_stands_beside_what_stood_has_not_come(first):
     earlier = with_post(first, np.array([2.0, 0.2]))
     for apart_m, has_come in ((0.05, False), (0.3, True)):
@@ -220,6 +223,7 @@ def test_nothing_has_changed_where_nothing_did(first, second):
     assert (change != 0).sum() <= 4
 
 
+@pytest.mark.slow
 def test_maps_of_different_places_stay_apart(first):
     with pytest.raises(MapError, match=r'77\.map: shows no place of 0\.map'):
         merge(first, mapped(THERE, seed=77))

@@ -59,6 +59,7 @@ def test_with_a_wrong_network_tracking_goes_on_and_it_is_said(tmp_path, drive, c
     assert points[0] == 'id,class' and {row.partition(',')[2] for row in points[1:]} == {chosen}
 
 
+@pytest.mark.slow
 def test_what_moves_leaves_features_and_floor_even_if_the_network_sees_keyframes_alone(
     tmp_path, drive
 ):
@@ -87,6 +88,7 @@ def test_a_file_that_is_no_network_ends_run_and_replay_in_one_line(tmp_path, dri
     assert not (tmp_path / 'out').exists()
 
 
+@pytest.mark.slow
 def test_a_saved_map_keeps_its_classes(tmp_path, drive):
     network = constant_network(tmp_path / 'n.onnx', 'floor', CLASSES, floor=['floor'])
     saved, again, out = (tmp_path / name for name in ('a.map', 'b.map', 'out'))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from camera_recordings import kitti_line, write_image
 from command_line import segfloor
 from stereo_drive import room_drive
@@ -13,6 +14,7 @@ from stereo_room import CAMERA
 from segfloor_ros.core.plugins.rig.check import SETTLED_FRAMES
 
 
+@pytest.mark.slow
 def test_two_cameras_side_by_side_are_named_and_not_mapped(tmp_path: Path) -> None:
     folder, out = tmp_path / 'phones', tmp_path / 'out'
     rng = np.random.default_rng(3)

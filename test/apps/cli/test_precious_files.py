@@ -113,7 +113,7 @@ TO_FILES = {
 TO_FOLDERS = {
     'run': 'run {made}/drive --out {}',
     'replay': 'replay {made}/drive --out {}',
-    'simulate': 'simulate corridor1 --out {}',
+    'simulate': 'simulate lane --set camera.width=64 --set camera.height=48 --out {}',
     'explore': 'explore complex_room --out {}',
     'check': 'check {made}/suite.yaml --out {}',
     'demo': 'demo --lockstep --out {}',
@@ -190,7 +190,7 @@ def test_no_input_is_written_to(words, made, tmp_path):
 
 def test_what_segfloor_wrote_is_replaced_and_what_was_changed_since_is_not(made, tmp_path):
     out, saved = tmp_path / 'out', tmp_path / 'my.map'
-    words = ['run', made / 'drive', '--out', out, '--save-map', saved, *KNOWN_MOUNT]
+    words = ['run', made / 'drive', '--frames', 8, '--out', out, '--save-map', saved, *KNOWN_MOUNT]
     for _ in range(2):
         done = segfloor(*words)
         assert done.returncode == 0, done.stderr

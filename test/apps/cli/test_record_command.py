@@ -117,6 +117,7 @@ def test_what_a_killed_recorder_wrote_is_read(tmp_path, name) -> None:
     assert [path.name for path in out.parent.iterdir()] == [name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('number', [signal.SIGHUP, signal.SIGTERM])
 def test_a_signal_completes_the_recording(recording, tmp_path, number) -> None:
     graph, publishers = recording.graph, recording.publishers

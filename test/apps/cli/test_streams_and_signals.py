@@ -69,6 +69,7 @@ def test_a_closed_output_does_not_end_up_in_a_result(drive, tmp_path):
         np.loadtxt(path)
 
 
+@pytest.mark.slow
 def test_names_pass_no_control_characters_on_and_need_not_be_text(drive, tmp_path):
     name = os.fsdecode(b'dr\xff\x1b[31mive')
     strange = tmp_path / name
@@ -133,6 +134,7 @@ def test_a_suite_that_is_terminated_ends_in_silence(drive, tmp_path):
     assert (process.returncode, errors) == (128 + signal.SIGTERM, '')
 
 
+@pytest.mark.slow
 def test_threads_of_the_environment_do_not_change_a_result(drive, tmp_path):
     for threads in ('1', '7'):
         done = shell('segfloor run "$DRIVE" --out "$OUT"', DRIVE=drive, OUT=tmp_path / threads,

@@ -136,6 +136,7 @@ def test_a_loop_is_noted_and_marked_on_the_path(run, tmp_path):
     np.testing.assert_allclose(marked, keyframes[1, 1:4], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_running_nodes_are_shown_until_an_interrupt(tmp_path):
     pytest.importorskip('rerun', reason='rerun is not installed')
     rclpy = pytest.importorskip('rclpy', reason='ROS is not installed')
@@ -225,6 +226,7 @@ def test_the_file_of_a_view_may_be_left_out(words, read):
     assert main.with_optional_values(words.split()) == read.split()
 
 
+@pytest.mark.slow
 def test_the_page_is_served_on_this_machine_alone_and_ends_with_the_command(recording) -> None:
     pytest.importorskip('rerun_cli')
     environment = {k: v for k, v in os.environ.items() if not k.endswith('DISPLAY')}

@@ -51,6 +51,7 @@ def board_rows_px(image: np.ndarray) -> np.ndarray:
     return cv2.cornerSubPix(image, corners, (5, 5), (-1, -1), end).reshape(-1, 2)[:, 1]
 
 
+@pytest.mark.slow
 def test_corridor_is_read_as_it_is(shared_data: Path) -> None:
     folder = shared_data / 'corridor'
     source = opened(folder)
@@ -73,6 +74,7 @@ def test_kitti06_has_its_times_and_baseline(shared_data: Path) -> None:
     assert source.camera.baseline_m == pytest.approx(0.537, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_library_comes_in_natural_order_and_rectified(shared_data: Path) -> None:
     folder = shared_data / 'library'
     source = opened(folder)
@@ -118,6 +120,7 @@ def test_a_fisheye_of_16_bits_is_rectified(shared_data: Path) -> None:
     assert -felt[1] / np.linalg.norm(felt) > 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', ['library', 'euroc_tiny', 'tumvi'])
 def test_real_recordings_survive_the_round_trip(
     shared_data: Path, tmp_path: Path, name: str

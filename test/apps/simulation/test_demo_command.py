@@ -53,6 +53,7 @@ def test_the_demo_drive_is_small_and_complete():
     assert len(truth.base_poses) == source.frame_count == 273
 
 
+@pytest.mark.slow
 def test_a_scene_is_rendered_again_beside_the_folder_that_came_of_it(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for _ in range(2):
@@ -87,6 +88,7 @@ def test_demo_maps_and_scores(tmp_path):
     assert float(occupied[3]) > 94.0
 
 
+@pytest.mark.slow
 def test_finer_rendering_is_another_picture_of_the_same(files, tmp_path):
     noiseless = ('--set', 'camera.noise_sigma=0', '--set', 'path.waypoints=[[0, 0], [0.1, 0]]')
     images = []

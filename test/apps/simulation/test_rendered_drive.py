@@ -128,6 +128,7 @@ def test_unrectified_images_rectify_to_the_ideal_ones(room):
             assert np.median(error) < 3.0
 
 
+@pytest.mark.slow
 def test_person_moves_through_the_picture():
     person = [{'points': [[2.0, -0.8], [2.0, 0.8]], 'speed_m_s': 0.8}]
     with simulate(people=person) as walk, simulate() as empty:
@@ -144,6 +145,7 @@ def test_person_moves_through_the_picture():
             assert moving[nearer].all() and moving.sum() < 1.2 * nearer.sum()
 
 
+@pytest.mark.slow
 def test_a_mover_is_not_in_the_true_map_and_its_mask_is_written_for_every_frame(tmp_path):
     people = [{'points': [[2.0, -0.8], [2.0, 0.8]], 'start_s': 1.0}]
     cars = [{'points': [[1.5, 0.0], [3.0, 0.0]], 'size': [0.4, 0.3, 0.3], 'speed_m_s': 0.2}]
@@ -191,6 +193,7 @@ def test_recording_has_the_layout_of_a_kitti_folder_with_truth(room, tmp_path):
     assert (out / 'times.txt').read_text() == 'mine'
 
 
+@pytest.mark.slow
 def test_labels_say_what_each_pixel_shows_and_whose_it_is(tmp_path):
     people = [{'points': [[2.0, -0.8], [2.0, 0.8]], 'start_s': 9.0}]
     cars = [{'points': [[1.5, 0.3], [3.0, 0.3]], 'size': [0.4, 0.3, 0.3], 'start_s': 9.0}]
@@ -244,6 +247,7 @@ def test_a_path_into_an_obstacle_is_refused():
         simulate(path={'waypoints': [[0, 0], [2.5, 0.6]]})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('missing', ['GL', '(?<!E)GL'])
 def test_without_a_gl_library_one_line_names_the_package(tmp_path, missing):
     # A ctypes that finds no GL library, or EGL alone, as on a machine without them.

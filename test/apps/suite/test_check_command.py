@@ -104,6 +104,7 @@ def test_what_became_worse_than_the_baseline_is_named(room, tmp_path):
     assert '(baseline ' in second.stderr
 
 
+@pytest.mark.slow
 def test_what_a_check_has_found_is_printed_as_json_alone(tmp_path):
     text = 'recordings: [{{input: {empty}, name: empty, expect: {{tracked_percent: 100}}}}]'
     done = check(suite_of(tmp_path, tmp_path, text), '--out', tmp_path / 'out', '--json')
@@ -190,6 +191,7 @@ def programs() -> list[psutil.Process]:
     return [c for c in children if 'segfloor_ros.apps.cli.main' in ' '.join(c.cmdline())]
 
 
+@pytest.mark.slow
 def test_a_recording_that_hangs_ends_at_its_time_out(room, tmp_path):
     start_s = time.monotonic()
     outcome = do_job(job_of(room, tmp_path, timeout_s=1.0))

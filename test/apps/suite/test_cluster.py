@@ -84,6 +84,7 @@ def mapping_together(check: subprocess.Popen[str], programs: int) -> list[psutil
     raise AssertionError(check.communicate())
 
 
+@pytest.mark.slow
 def test_nothing_of_a_check_listens(room, tmp_path):
     check = start_check(room, tmp_path, '--out', str(tmp_path / 'out'), '--jobs', '2')
     processes = mapping_together(check, 2)
@@ -108,9 +109,9 @@ SLOW = pytest.mark.slow
 @pytest.mark.parametrize(
     ('jobs', 'number'),
     [
-        ('2', signal.SIGINT),
+        pytest.param('2', signal.SIGINT, marks=SLOW),
         ('1', signal.SIGTERM),
-        ('2', signal.SIGKILL),
+        pytest.param('2', signal.SIGKILL, marks=SLOW),
         pytest.param('1', signal.SIGINT, marks=SLOW),
         pytest.param('2', signal.SIGTERM, marks=SLOW),
         pytest.param('1', signal.SIGKILL, marks=SLOW),

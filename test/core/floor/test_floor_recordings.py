@@ -115,6 +115,7 @@ def test_weak_texture_survives_compression(floor_kind):
     assert recall['deblocked'] > max(0.92, recall['as it is'] + 0.04)
 
 
+@pytest.mark.slow
 def test_what_lies_right_before_a_rover_is_not_floor(shared_data):
     """A coil of rope, tyres and a stone: black, plain, or nearer than most of the floor."""
     settings = resolve(None, (), stereo_camera={'input': str(shared_data / 'rover')})

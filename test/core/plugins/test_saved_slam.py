@@ -192,6 +192,7 @@ def test_a_drive_in_a_loaded_map_maps_on_its_own_at_once_and_gives_that_up_when_
     assert before <= len(slam.map.keyframes) < before + len(poses)
 
 
+@pytest.mark.slow
 def test_what_a_drive_maps_beside_a_loaded_map_comes_once_it_was_looked_for_in_vain(mapped):
     slam, other = loaded(mapped, localize=False), StereoRoom(seed=77)
     poses = there(25)
@@ -225,6 +226,7 @@ def test_a_late_mask_of_a_submap_that_was_given_up_takes_nothing_from_the_map(ma
     assert slam.map.alive.sum() == alive
 
 
+@pytest.mark.slow
 def test_a_frame_that_is_lost_is_looked_for_once(mapped, monkeypatch):
     """Two sightings by one frame and one by another are no proof."""
     slam, other = loaded(mapped, localize=False), StereoRoom(seed=77)

@@ -102,6 +102,7 @@ def test_a_place_that_is_not_seen_is_held_and_said_to_be_unsure(frames):
     assert 0.1 < jump_m < 3 * sigma_m(held)
 
 
+@pytest.mark.slow
 def test_a_heading_that_is_unsure_makes_the_way_since_unsure_across_it(frames):
     """The robot was carried, and drives an arc of 1 m before the map is recognised."""
     slam, _ = broken_off(frames[:FRAMES])
@@ -168,6 +169,7 @@ def test_what_is_mapped_elsewhere_merges_when_the_map_is_recognised(frames):
     assert len(slam.to_arrays()['keyframe_stamp_ns']) > len(known) + 3
 
 
+@pytest.mark.slow
 def test_the_farther_from_where_a_submap_began_the_less_is_known_of_the_place(frames):
     slam, _ = broken_off(frames[:FRAMES])
     mapped = []
@@ -183,6 +185,7 @@ def test_the_farther_from_where_a_submap_began_the_less_is_known_of_the_place(fr
     assert sigma_m(end) == pytest.approx(expected, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_map_that_had_hardly_begun_stays(frames):
     slam, _ = broken_off(frames[:3])
     known = slam.to_arrays()['keyframe_stamp_ns']

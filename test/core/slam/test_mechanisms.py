@@ -45,6 +45,7 @@ def test_points_of_a_place_are_tracked_again_though_none_of_them_was_seen_lately
     np.testing.assert_array_equal(local.point_ids, np.arange(10))
 
 
+@pytest.mark.slow
 def test_smaller_novelty_makes_more_keyframes():
     def keyframes(novelty):
         settings = StereoSlamSettings(num_features=600, keyframe_novelty=novelty)

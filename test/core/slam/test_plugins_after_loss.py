@@ -63,6 +63,7 @@ def rooms():
     return StereoRoom(), StereoRoom(seed=77)
 
 
+@pytest.mark.slow
 def test_a_map_that_begins_anew_has_none_of_the_frames_before(rooms) -> None:
     slam, resets = equipped()
     room, other = rooms

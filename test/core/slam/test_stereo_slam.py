@@ -98,6 +98,7 @@ def test_repeats_to_the_bit(frames, results):
         np.testing.assert_array_equal(a.T_map_odom, b.T_map_odom)
 
 
+@pytest.mark.slow
 def test_the_background_thread_loses_nothing(frames):
     slam = equipped_slam(CAMERA, SETTINGS, MOUNT, background=True)
     results = [result for frame in frames for result in slam.process(frame)]
@@ -112,6 +113,7 @@ def test_the_background_thread_loses_nothing(frames):
         assert np.linalg.norm((invert(a.T_odom_base) @ b.T_odom_base)[:3, 3]) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('is_late', [False, True])
 def test_pose_and_images_of_a_keyframe_are_announced_before_the_map_takes_it_in(frames, is_late):
     """Before its features are measured; late where an adjustment has still to move the map."""
@@ -284,6 +286,7 @@ def test_a_jump_without_any_prediction_is_found_by_descriptors(frames):
     assert np.linalg.norm((invert(far) @ pose_of(result))[:3, 3]) < 0.02
 
 
+@pytest.mark.slow
 def test_who_was_lost_must_find_what_should_be_there(frames, monkeypatch):
     monkeypatch.setattr('segfloor_ros.core.slam.places.place_recognition.CHANCE_SHARE', 1.0)
     slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
@@ -344,6 +347,7 @@ def test_results_wait_for_the_mount_and_none_is_lost(frames):
     assert [r.index for batch in batches for r in batch] == list(range(len(frames)))
 
 
+@pytest.mark.slow
 def test_a_path_alone_waits_for_no_mount_and_measures_it_all_the_same(frames):
     """Places are believed by what the ground shows, too, so the path would differ without it."""
     with_map, alone = make_slam(CAMERA, SETTINGS), make_slam(CAMERA, SETTINGS, CAMERA_AS_BASE)

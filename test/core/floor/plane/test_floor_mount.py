@@ -191,6 +191,7 @@ def test_poses_come_before_the_mount_is_known():
     assert positions[-1] == pytest.approx([0.1 * (settled - 1), 0.0, 0.0], abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_lost_before_its_mount_is_known_begins_again():
     """It faces a wall and turns away from it: nothing of what it saw first is seen again."""
     mount = Mount(0.35, np.radians(8.0))
@@ -211,6 +212,7 @@ def test_a_camera_that_is_lost_before_its_mount_is_known_begins_again():
     assert path.stamp_ns[0] == results[7].stamp_ns
 
 
+@pytest.mark.slow
 def test_after_a_while_the_best_plane_will_do():
     """A small rug is all that has texture: nothing shows its plane better than to some per cent."""
     rug = Patch((0.9, -0.15, 0.0), (0.2, 0, 0), (0, 0.13, 0), True, contrast=25.0, seed=5)
@@ -341,6 +343,7 @@ def test_disagreement_names_both_numbers():
     assert disagreement(used, seen, np.array([0.03, 0.03, 0.04])) is None
 
 
+@pytest.mark.slow
 def test_a_mount_that_later_looks_contradict_is_corrected_and_the_map_follows():
     """It begins before a stage, drives past it, and sees the floor then."""
     mount = Mount(0.35, np.radians(8.0))
@@ -408,6 +411,7 @@ def test_car_on_a_road(shared_data):
     assert mount.height_m == pytest.approx(1.65, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_has_a_mount_too():
     """It has but one keyframe. Its floor is seen ever again, and no better: it takes some time."""
     scene = Scene([floor_patch(), wall(), *box(1.6, 0.5, 0.4, 0.3)], camera=SMALL_CAMERA)

@@ -121,6 +121,7 @@ def test_a_late_mask_takes_the_points_back_that_its_keyframe_has_made():
     np.testing.assert_array_equal(keyframe.point_id[older], ids[older])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('place', [lambda index: None, standing])
 def test_what_stands_is_kept(place):
     results = run(MovingDrive(place))
@@ -164,6 +165,7 @@ def walking_into_the_image(index):
     return (0.03 * index + 0.4, -0.25 + 0.12 * (index - 20)) if 20 <= index <= 23 else None
 
 
+@pytest.mark.slow
 def test_what_suddenly_fills_most_of_the_image_does_not_take_the_pose_along():
     drive = MovingDrive(walking_into_the_image)
     assert (drive.mask(22) > 0).mean() > 0.7

@@ -122,6 +122,7 @@ def test_depth_that_is_late_is_found_with_its_lag(boxes, lag) -> None:
     assert 'the depth one lags' in found['not_simultaneous'].line()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('shift_px', 'expected'), [(0, set()), (20, {'depth_unaligned'})])
 def test_depth_of_a_real_camera(shared_data, shift_px, expected) -> None:
     frames = list(opened(shared_data / 'kitchen').frames())[:60]

@@ -122,6 +122,7 @@ def test_a_small_lag_of_a_rig_that_is_shaken_is_that_of_a_rig() -> None:
     assert 'no_rig' not in faults(taken, camera)
 
 
+@pytest.mark.slow
 def test_the_figure_of_a_lag_stays_as_it_was_said(frames) -> None:
     check, said = RigCheck(CAMERA), set()
     room = StereoRoom(seed=5)
@@ -237,6 +238,7 @@ def test_nothing_is_said_of_motion_while_frames_are_skipped(turning) -> None:
     assert faults([f for i, f in enumerate(twice) if i % 5 < 2], wrong) == {}
 
 
+@pytest.mark.slow
 def test_a_turn_after_a_long_way_shows_the_focal_length() -> None:
     """Once nothing was found in motion few frames are looked at, but turns are."""
     room = StereoRoom(seed=5)

@@ -128,6 +128,7 @@ def test_a_gyroscope_alone_bridges_a_second(frames):
     assert sigma_m > 2 * errors_m(results)[19] and sigma_m > 0.1
 
 
+@pytest.mark.slow
 def test_wheels_that_slip_while_the_camera_sees_are_found_out_and_cost_nothing(frames):
     room = StereoRoom()
     seen = [room.frame(k, base_at(k)) for k in range(FRAMES)]

@@ -61,6 +61,7 @@ def test_speeding_up_is_not_taken_for_gravity():
     assert degrees_between(up.direction, UP) < 0.1
 
 
+@pytest.mark.slow
 def test_the_bias_is_told_from_gravity_where_the_camera_turns():
     straight, turning = (driven(20.0, turns).up_world for turns in (False, True))
     assert degrees_between(straight.direction, UP) > 0.3
@@ -68,6 +69,7 @@ def test_the_bias_is_told_from_gravity_where_the_camera_turns():
     assert turning.sigma_rad < 0.5 * straight.sigma_rad
 
 
+@pytest.mark.slow
 def test_an_imu_beside_the_camera_feels_its_own_circle_which_is_not_taken_for_gravity():
     beside, at_camera = (
         driven(20.0, True, place_m=place).up_world for place in (BESIDE, (0, 0, 0))

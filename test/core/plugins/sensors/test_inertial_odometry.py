@@ -49,6 +49,7 @@ def blind_drive(until_s, has_accel, place_m=(0.0, 0.0, 0.0), given_m=None):
     return motion, np.array(errors_m)
 
 
+@pytest.mark.slow
 def test_an_imu_carries_the_camera_through_seconds_without_images():
     # It drives to and fro by 0.6 m, speeds up by 0.7 m/s², and turns by 45 degrees to either side.
     motion, errors_m = blind_drive(SEEN_S + 3.0, has_accel=True)
@@ -90,6 +91,7 @@ def test_without_an_accelerometer_the_speed_is_constant_for_a_second():
     assert errors_m[9] > 0.1
 
 
+@pytest.mark.slow
 def test_a_camera_that_was_lost_is_found_where_it_may_look_only():
     motion, _ = blind_drive(SEEN_S + 9.0, has_accel=False)
     assert motion.state.is_lost
@@ -105,6 +107,7 @@ def test_a_camera_that_was_lost_is_found_where_it_may_look_only():
     assert is_near(behind, motion.expected(until_ns + 10**9))
 
 
+@pytest.mark.slow
 def test_a_prediction_for_a_camera_that_was_lost_has_turned_on():
     motion, _ = blind_drive(SEEN_S + 9.0, has_accel=False)
     true = invert(pose(0, True)) @ pose(SEEN_S + 9.0, True)

@@ -130,6 +130,7 @@ def test_a_bent_rig_is_found_and_its_distances_put_right(seed, contrast, offset_
     assert abs(length(results) - 1.95) < 0.5 * abs(length(believed) - 1.95)
 
 
+@pytest.mark.slow
 def test_an_exact_rig_stays_exact():
     slam, results = room_drive()
     assert abs(slam.rig.offset.value_px) < 0.03  # known to 0.036

@@ -136,6 +136,7 @@ def there_on_tiles(corridor):
     return driven_there(REPEATED)
 
 
+@pytest.mark.slow
 def test_views_of_the_floor_are_saved(there):
     slam, saved = there
     other = equipped_slam(CAMERA, SETTINGS, MOUNT)
@@ -153,6 +154,7 @@ def test_maps_of_earlier_releases_have_no_views_of_the_floor(there):
     assert all(k.ground is NOTHING for k in slam.map.keyframes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('seed', 'is_known'), [(0, True), (2, False)], ids=['there', 'same floor, other walls']
 )
@@ -173,6 +175,7 @@ def test_a_session_that_starts_the_other_way_is_recognised_by_the_floor(
     assert (off_m < 0.02) == is_known
 
 
+@pytest.mark.slow
 def test_a_keyframe_that_looks_like_another_place_than_its_floor_does_counts_for_neither(
     there, monkeypatch
 ):

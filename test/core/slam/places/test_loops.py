@@ -75,6 +75,7 @@ def test_a_drift_is_found_and_taken_away(closed):
     assert errors[-1] < 0.03
 
 
+@pytest.mark.slow
 def test_a_loop_that_contradicts_the_map_is_not_noted_as_closed(monkeypatch):
     monkeypatch.setattr(back_end, 'apply_closing', lambda *_: False)
     slam, _ = drive(np.array([0.25, 0.0, 0.1, 0.0, 0.03, 0.0]))

@@ -163,6 +163,7 @@ def sparse_map_without(sparse_map, views):
     return sparse_map
 
 
+@pytest.mark.slow
 def test_laps_of_a_room_add_no_points_after_the_second():
     room = StereoRoom()
     slam = equipped_slam(CAMERA, StereoSlamSettings(num_features=500), MOUNT)

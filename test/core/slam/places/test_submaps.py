@@ -85,6 +85,7 @@ def test_the_odometry_goes_on_where_the_camera_got_lost(merged):
     assert np.linalg.norm(np.diff(odom[:, :3, 3], axis=0), axis=1).max() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     'waited_s, is_there', [pytest.param(0, False, marks=pytest.mark.slow), (10, True)]
 )
@@ -104,6 +105,7 @@ def test_a_submap_is_merged_only_where_the_robot_can_have_driven(waited_s, is_th
     assert (slam.session.state.holds_results) is not is_there
 
 
+@pytest.mark.slow
 def test_a_submap_that_is_never_recognised_is_not_in_the_map():
     slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     drive(slam, KNOWN)
@@ -121,6 +123,7 @@ def test_a_submap_that_is_never_recognised_is_not_in_the_map():
     )
 
 
+@pytest.mark.slow
 def test_of_two_that_were_not_joined_the_larger_is_the_map():
     slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     way = [planar_pose(0.03 * k, 0.0, 0.03 * k) for k in range(60)]
@@ -141,6 +144,7 @@ def test_of_two_that_were_not_joined_the_larger_is_the_map():
     assert slam.to_arrays()['keyframe_stamp_ns'][0] == began
 
 
+@pytest.mark.slow
 def test_a_map_that_had_hardly_begun_is_given_up():
     slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     first, poses = len(KNOWN[:5]), KNOWN[:5] + BEHIND + TURN
@@ -161,6 +165,7 @@ def test_a_map_that_had_hardly_begun_is_given_up():
     assert rest[0].keyframe.cloud.point_id.min() > max(given_up)
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_lost_again_is_looked_for_in_the_map():
     slam = equipped_slam(CAMERA, SETTINGS, MOUNT)
     drive(slam, KNOWN)

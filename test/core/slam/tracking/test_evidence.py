@@ -51,6 +51,7 @@ def pose_of(points: Array, uvd_px: Array, searched: Searched = WHOLE) -> PoseEst
     return refine_pose(CAMERA, T_start, points, observations, searched=searched, first=first)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('has_disparity', [True, False])
 def test_matches_that_have_to_do_with_nothing_prove_no_pose(has_disparity: bool) -> None:
     rng = np.random.default_rng(1)
