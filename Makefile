@@ -19,8 +19,9 @@ NOBLE_CANDIDATES := $(PYTHON312) python3.12 $(wildcard $(HOME)/.pyenv/versions/3
 ON_VERSIONS := core apps/recordings apps/evaluation apps/test_chessboard_calibration.py \
   apps/test_results_and_trajectory.py nodes/messages nodes/test_yaml_files.py nodes/test_settings.py
 IS_312 := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 12))
-# Tests of one module stay together where they can: its fixtures are made once.
-PARALLEL := -n 2 --dist worksteal
+# Tests of one module stay together where they can: its fixtures are made once. Tests of nodes wait
+# for messages most of the time: three processes keep two processors busy.
+PARALLEL := -n 3 --dist worksteal
 CODE := segfloor_ros test launch_configs docs tools .ci setup.py
 
 # The tests start many processes, which need not compile the same modules again.

@@ -349,6 +349,7 @@ def test_goals_that_are_given_are_driven_to_in_their_order_and_one_in_a_wall_is_
     ]
 
 
+@pytest.mark.slow
 def test_a_goal_to_which_a_wall_has_come_too_near_is_reached_from_the_place_beside_it() -> None:
     goal = Goal(np.array([1.12, 0.86]))  # The place is at 1.05, 0.75.
     drive = Drive(grid_of(TWO_ROOMS), Explorer(BODY, [goal]), np.array([0.6, 0.55, 0.0]))
@@ -437,6 +438,7 @@ def test_a_goal_behind_a_shut_door_is_driven_to_after_the_others_once_that_is_op
     assert [goal.name for goal in drive.explorer.ended if goal.is_reached] == ['here', 'behind']
 
 
+@pytest.mark.slow
 def test_what_was_behind_shut_doors_is_explored_once_they_are_open_and_goals_lie_there_too() -> (
     None
 ):
@@ -560,6 +562,7 @@ def test_goals_are_drawn_wherever_the_map_leads_also_behind_somebody_in_the_way(
     assert any(goal.point[0] > 1.5 for goal in explorer._ahead)
 
 
+@pytest.mark.slow
 def test_of_drawn_goals_the_nearest_is_next_and_one_without_a_way_waits_for_the_others() -> None:
     explorer = Explorer(BODY, 20, seed=2)
     drive = Drive(grid_of(TWO_ROOMS), explorer, np.array([0.6, 0.55, 0.0]), is_known=True)

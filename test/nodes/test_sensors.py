@@ -66,6 +66,7 @@ def test_frames_that_show_nothing_have_the_pose_of_the_wheels(make_graph, drive)
     assert min(sigma_m[k] for k in BLIND) > 2 * sigma_m[5]
 
 
+@pytest.mark.slow
 def test_where_the_imu_of_a_recording_is_comes_through_tf(make_graph, drive) -> None:
     pytest.importorskip('tf2_msgs')
     folder, _ = drive
@@ -93,6 +94,7 @@ def test_where_the_imu_of_a_recording_is_comes_through_tf(make_graph, drive) -> 
     assert places()[-1] == [0.1, 0.0, -0.3]
 
 
+@pytest.mark.slow
 def test_where_no_topic_tells_the_odometry_that_another_node_broadcasts_is_taken(
     make_graph, drive, monkeypatch
 ) -> None:

@@ -59,6 +59,7 @@ def test_in_step_each_frame_waits_for_the_command_at_the_frame_before_the_last()
             assert set(np.diff(stamps(measured))) == {10**7}
 
 
+@pytest.mark.slow
 def test_against_the_clock_it_stops_when_no_command_comes_any_more() -> None:
     arguments = ('-p', 'rate:=5.0', '-p', 'scene:=lane', '-p', f"scene_values:='{SMALL}'",
                  '-p', 'stamped_commands:=false')  # fmt: skip

@@ -84,6 +84,7 @@ def test_a_clock_that_jumps_back_resets_the_map_which_is_saved_first(
     assert parts['slam']['keyframe_stamp_ns'].min() >= SHIFT_NS
 
 
+@pytest.mark.slow
 def test_images_without_stamps_are_named(chain, frames) -> None:
     said = warnings_of(chain)
     images = [chain._inputs[f'{side}/image_raw'] for side in ('left', 'right')]

@@ -53,6 +53,7 @@ def test_slam_has_what_sensors_measured_up_to_a_frame_before_it():
     assert had == [(0, 1), (1, 4), (2, 6)]
 
 
+@pytest.mark.slow
 def test_the_error_of_a_path_without_a_mechanism_is_printed(tmp_path) -> None:
     frames, T_world_base = room_drive(8)
     drive = write_kitti(tmp_path / 'room', frames)

@@ -97,6 +97,7 @@ def test_the_map_turns_to_and_fro_as_after_loop_closings():
     assert keyframes[150].path.T_map_base[-1, 1, 3] == pytest.approx(150 * 0.25 * 0.002, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_data():
     def data(seed):
         keyframe = list(Corridor(3, seed).drive())[-1]

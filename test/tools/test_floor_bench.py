@@ -159,6 +159,7 @@ def test_a_drive_comes_back_from_disk_and_is_segmented(tmp_path) -> None:
     assert tiles([worst] * 5).shape[0] == 2 * (worst.shape[0] // 2)
 
 
+@pytest.mark.slow
 def test_drives_without_a_recording_are_left_out(tmp_path) -> None:
     drives = bench_drives(tmp_path)
     assert {one.name for one in drives} >= SCENES.keys()

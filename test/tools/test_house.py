@@ -30,6 +30,7 @@ def test_constants_hold_numbers() -> None:
     assert constants(MODULE) == (2, 3)
 
 
+@pytest.mark.slow
 def test_rooms_add_up(capsys) -> None:
     main()
     heading, *rooms, total = (line.split() for line in capsys.readouterr().out.splitlines())

@@ -21,6 +21,7 @@ print(free_domain())
 """
 
 
+@pytest.mark.slow
 def test_no_two_processes_are_told_the_same_domain(monkeypatch) -> None:
     monkeypatch.setattr(os, 'getpid', lambda: SAME_PID)
     mine = free_domain()

@@ -120,6 +120,7 @@ def test_points_of_the_second_map_are_as_high_above_their_floor_as_before(first,
     assert np.median(gap_m) < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('finish', [lambda saved: saved, prune], ids=['merged', 'pruned'])
 def test_a_robot_goes_on_with_a_merged_map(merged, finish):
     pipeline = make_pipeline(CAMERA, resolve(assignments=[]))
@@ -176,6 +177,7 @@ def test_what_has_come_and_what_has_gone(first):
         }
 
 
+@pytest.mark.slow
 def test_what_is_gone_goes_with_the_views_that_showed_it(first, second, tmp_path):
     xy_m = np.array([2.0, -1.2])  # where the second drive looks, but not from near
     whole = merge(with_post(first, xy_m), second)
@@ -218,6 +220,7 @@ def test_what_stands_beside_what_stood_has_not_come(first):
         assert (change == 1).any() == has_come
 
 
+@pytest.mark.slow
 def test_nothing_has_changed_where_nothing_did(first, second):
     _, change = changes(first, second)
     assert (change != 0).sum() <= 4

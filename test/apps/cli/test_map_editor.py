@@ -136,6 +136,7 @@ def test_what_the_page_saves_is_written_beside_the_map(page, tmp_path) -> None:
     assert (load_map(tmp_path / 'corrected_keepout.yaml').cells == F).all()
 
 
+@pytest.mark.slow
 def test_only_who_has_the_address_can_save_and_nonsense_is_refused(page, tmp_path) -> None:
     address, _ = page
     root = address.rsplit('/', 2)[0]

@@ -245,6 +245,7 @@ def test_calibration_files_of_the_user_stay(tmp_path):
             (target / name).unlink()
 
 
+@pytest.mark.slow
 def test_a_view_may_lie_in_the_folder_of_results(made, tmp_path):
     pytest.importorskip('rerun')
     out = tmp_path / 'out'

@@ -234,6 +234,7 @@ def backwards_stamps(folder):
     return folder, 'times.txt'
 
 
+@pytest.mark.slow
 def test_a_copy_that_broke_off_is_mapped_as_far_as_it_goes(recording, tmp_path):
     folder = tmp_path / 'drive'
     shutil.copytree(recording, folder)
@@ -523,6 +524,7 @@ def test_heights_of_a_drive_are_medians_of_all_and_of_its_ends():
     assert floor_heights(heights_m[:0], 3) == {'planes': 0, 'looks': 3}
 
 
+@pytest.mark.slow
 def test_a_report_names_its_colours_and_the_length_of_the_path(result, tmp_path):
     run = tmp_path / 'run'
     shutil.copytree(result[0], run)

@@ -120,6 +120,7 @@ def test_a_signal_while_modules_are_imported_ends_in_silence(
     assert (process.returncode, errors) == (128 + number if status is None else status, '')
 
 
+@pytest.mark.slow
 def test_a_suite_that_is_terminated_ends_in_silence(drive, tmp_path):
     suite = tmp_path / 'suite.yaml'
     suite.write_text(f'recordings:\n  - input: {drive}\n')

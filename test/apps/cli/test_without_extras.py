@@ -95,7 +95,7 @@ def test_the_demo_runs_and_scores_the_map_without_extras(tmp_path):
         (('check', 'suite.yaml', '--out', 'out'), 'junitparser', 'junitparser'),
         (('evaluate', 'trajectory', 'a.txt', 'b.txt'), 'evo', "'segfloor_ros[evaluate]'"),
         (('view', 'room'), 'rerun', "'segfloor_ros[view]'"),
-        (('simulate', 'corridor1', '--out', 'out'), 'MuJoCo', "'segfloor_ros[sim]'"),
+        (('simulate', 'lane', '--out', 'out'), 'MuJoCo', "'segfloor_ros[sim]'"),
     ],
 )
 def test_a_command_names_in_one_line_what_to_install(words, package, installed, tmp_path) -> None:

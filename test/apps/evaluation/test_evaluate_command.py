@@ -85,6 +85,7 @@ def test_map_with_a_trajectory_of_the_run(tmp_path):
     assert 2.0 < score['area_m2'] < 6.0
 
 
+@pytest.mark.slow
 def test_a_trajectory_of_the_run_lies_where_its_map_is_aligned(tmp_path):
     """The same drive, in the frame of the estimate and, as `t x y yaw`, in that of the truth."""
     truth, drive, true_drive = write_map(tmp_path / 'truth'), tmp_path / 't.txt', tmp_path / 'b.txt'

@@ -70,6 +70,7 @@ def test_goals_and_path_are_where_the_frame_of_the_map_lies() -> None:
     assert (never_found['path_rmse_m'], never_found['tracked_share']) == (None, 0.0)
 
 
+@pytest.mark.slow
 def test_the_picture_has_a_strip_of_what_was_seen_below_the_map() -> None:
     grid = OccupancyGrid(np.full((10, 10), FREE, np.int8), 0.1, (-0.5, -0.5))
     stamps = [10**9 * i for i in range(20)]

@@ -186,6 +186,7 @@ def rendered(frames, **camera):
         pytest.skip(str(error))
 
 
+@pytest.mark.slow
 def test_a_lag_delivers_what_the_others_see_a_frame_later_or_earlier():
     before, here, after = rendered((-1, 0, 1))
     (late,) = rendered((0,), lag_s=0.05, depth_lag_s=0.05)
@@ -197,6 +198,7 @@ def test_a_lag_delivers_what_the_others_see_a_frame_later_or_earlier():
     assert alike[0] > 0.9 > max(alike[1:]) + 0.1, alike
 
 
+@pytest.mark.slow
 def test_a_rolling_shutter_shows_the_top_earlier_than_the_bottom():
     before, _, after = (frame.left.astype(float) for frame in rendered((-1, 0, 1)))
     (rolled,) = rendered((0,), rolling_s=0.1)

@@ -250,6 +250,7 @@ def test_a_drawn_floor_plan_becomes_the_same_map_again(tmp_path):
     assert_same_walls(tmp_path / 'plan.yaml')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', ['depot', 'house_map'])
 def test_floor_plan_becomes_the_same_map_again(shared_data, name):
     assert_same_walls(shared_data / 'maps' / f'{name}.yaml')

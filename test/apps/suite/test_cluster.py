@@ -188,6 +188,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(room, tmp_path):
     assert errors.count('\n') == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('address', ['tcp://me:s3cret@localhost:1', 'me:s3cret@localhost:1'])
 def test_credentials_of_a_scheduler_are_not_echoed(room, tmp_path, address):
     check = start_check(room, tmp_path, '--out', str(tmp_path / 'out'), '--scheduler', address)

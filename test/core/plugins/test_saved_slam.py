@@ -208,6 +208,7 @@ def test_what_a_drive_maps_beside_a_loaded_map_comes_once_it_was_looked_for_in_v
     assert sum(r.keyframe is not None for r in results) == len(slam.map.keyframes)
 
 
+@pytest.mark.slow
 def test_what_a_short_drive_maps_beside_a_loaded_map_comes_at_its_end(mapped):
     slam, other = loaded(mapped, localize=False), StereoRoom(seed=77)
     assert not [r for k in range(8) for r in slam.process(other.frame(5 + k, there(8)[k]))]
@@ -240,6 +241,7 @@ def test_a_frame_that_is_lost_is_looked_for_once(mapped, monkeypatch):
     assert len(stamps) == len(set(stamps)) == len(rooms)
 
 
+@pytest.mark.slow
 def test_after_a_pose_that_was_wrong_the_whole_map_is_searched_again(mapped, monkeypatch):
     monkeypatch.setattr('segfloor_ros.core.slam.places.place_recognition.SEARCHED_FRAMES', 20)
     slam, other, poses = loaded(mapped, localize=False), StereoRoom(seed=77), there(25)
@@ -252,6 +254,7 @@ def test_after_a_pose_that_was_wrong_the_whole_map_is_searched_again(mapped, mon
     assert come[-1][-1].tracked and slam.session.state is SessionState.MAPPING
 
 
+@pytest.mark.slow
 def test_images_that_cannot_be_tracked_are_said_while_a_loaded_map_is_searched(mapped):
     slam, other, poses = loaded(mapped, localize=False), StereoRoom(seed=77), there(25)
     for k in range(3):

@@ -78,6 +78,7 @@ def test_a_robot_that_drove_on_is_found_with_the_first_frame(frames):
     )
 
 
+@pytest.mark.slow
 def test_a_place_that_is_not_seen_is_held_and_said_to_be_unsure(frames):
     slam, _ = broken_off(frames[:FRAMES])
     for k in range(FRAMES + GAP, FRAMES + GAP + 10):

@@ -380,6 +380,7 @@ def test_a_camera_that_looks_straight_down_is_mounted_well():
     assert slam.mount is not None
 
 
+@pytest.mark.slow
 def test_waiting_for_the_mount_does_not_fill_the_memory(frames, monkeypatch):
     monkeypatch.setattr('segfloor_ros.core.slam.held_results.MAX_HELD_KEYFRAMES', 3)
     slam = equipped_slam(CAMERA, SETTINGS)

@@ -158,6 +158,7 @@ SWAYING = [(0.35, 8.0), (0.31, 11.0), (0.39, 6.0), (0.33, 12.0), (0.38, 5.0), (0
 """Heights in m and pitches in degrees of a camera that is carried in a hand."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('poses_sway', [True, False], ids=['seen by SLAM', 'not seen by SLAM'])
 def test_a_camera_that_a_hand_holds_has_no_mount(poses_sway):
     """Where the poses sway, it keeps no place above the plane; else planes do not repeat."""
@@ -172,6 +173,7 @@ def test_a_camera_that_a_hand_holds_has_no_mount(poses_sway):
     assert estimator.mount is None
 
 
+@pytest.mark.slow
 def test_poses_come_before_the_mount_is_known():
     scene = blank_floored(Mount(0.35, np.radians(8.0)), *box(1.6, 0.5, 0.4, 0.3))
     scene = replace(scene, camera=SMALL_CAMERA)

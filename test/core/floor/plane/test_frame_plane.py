@@ -193,6 +193,7 @@ def test_the_floor_is_found_once_frames_show_that_the_mount_is_another():
     assert stage.fixture.problem is None
 
 
+@pytest.mark.slow
 def test_a_camera_in_a_hand_is_said_to_be_in_one():
     scene = floor_patch(), wall(), *box(1.6, 0.5, 0.4, 0.3)
     assert carried([0.30, 0.303, 0.30, 0.297, 0.30], *scene).fixture.problem is None

@@ -328,6 +328,7 @@ def test_a_camera_that_is_knocked_on_its_way_is_noticed_by_a_few_looks(frames) -
     assert 'rows_apart' in check.faults
 
 
+@pytest.mark.slow
 def test_a_lag_shows_within_fifty_frames_of_motion_however_long_the_camera_stood(frames) -> None:
     standing = [frames[0]] * 3 * SETTLED_FRAMES
     drive = [*standing, *late(frames, 1.0)]

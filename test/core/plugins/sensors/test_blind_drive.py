@@ -115,12 +115,14 @@ def test_the_gyroscope_bias_was_learnt_before_it_was_needed(on_wheels):
     assert slam.sensors.messages == {'wheel_odometry': 5 * FRAMES - 4, 'imu': 20 * FRAMES - 19}
 
 
+@pytest.mark.slow
 def test_wheels_alone_bridge_as_well(frames):
     _, results = drive(frames, wheel_poses())
     assert all(result.tracked for result in results)
     assert errors_m(results).max() < 0.03
 
 
+@pytest.mark.slow
 def test_a_gyroscope_alone_bridges_a_second(frames):
     _, results = drive(frames, imu_samples())
     assert results[19].tracked and results[19].state.startswith('on gyroscope')
@@ -207,6 +209,7 @@ def test_points_that_slide_along_an_edge_do_not_outweigh_wheels(
         assert off_m == pytest.approx(slides_m, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_turn_without_a_picture_is_as_the_gyroscope_measures_it(frames):
     _, results = drive(frames, imu_samples())
     turned = invert(results[9].T_odom_base) @ results[19].T_odom_base

@@ -58,6 +58,7 @@ def test_an_imu_carries_the_camera_through_seconds_without_images():
     assert errors_m[-1] < 3 * sigma_m(motion.covariance) < 3 * SAME[0]
 
 
+@pytest.mark.slow
 def test_the_circle_of_an_imu_beside_the_camera_is_taken_off():
     _, errors_m = blind_drive(SEEN_S + 3.0, has_accel=True, place_m=BESIDE)
     assert len(errors_m) == 30
@@ -66,6 +67,7 @@ def test_the_circle_of_an_imu_beside_the_camera_is_taken_off():
     assert wrong_m.max() > 2 * errors_m.max()
 
 
+@pytest.mark.slow
 def test_a_blind_stretch_is_in_the_axes_of_the_camera_that_has_turned():
     """One look after 0.6 s, in which the camera turns by a good part of a right angle."""
     body = BodyMotion()
@@ -85,6 +87,7 @@ def test_a_blind_stretch_is_in_the_axes_of_the_camera_that_has_turned():
     assert np.linalg.norm((true @ motion.T_camera_world)[:3, 3]) < 0.02
 
 
+@pytest.mark.slow
 def test_without_an_accelerometer_the_speed_is_constant_for_a_second():
     _, errors_m = blind_drive(SEEN_S + 3.0, has_accel=False)
     assert 10 <= len(errors_m) < 20

@@ -120,6 +120,7 @@ def length(results):
     return float(np.linalg.norm(last[:3, 3]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('seed', 'contrast', 'offset_px'), BENT)
 def test_a_bent_rig_is_found_and_its_distances_put_right(seed, contrast, offset_px):
     room = {'seed': seed, 'contrast': contrast}

@@ -104,6 +104,7 @@ def test_a_large_map_is_adjusted_without_a_factor_and_comes_out_the_same(bent, m
     assert moved_m.max() < 0.02 * errors_m(bent).max()
 
 
+@pytest.mark.slow
 def test_rotations_stay_rotations_however_often_the_map_is_adjusted(bent):
     for _ in range(25):
         adjust(bent)

@@ -77,6 +77,7 @@ def test_a_word_that_all_views_hold_weighs_nothing():
     assert score[1] > 0.99
 
 
+@pytest.mark.slow
 def test_a_query_among_2000_keyframes_takes_milliseconds():
     index = PlaceIndex()
     for k in range(2000):

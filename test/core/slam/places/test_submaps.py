@@ -38,6 +38,7 @@ def merged():
     return slam, drive(slam, KNOWN + BEHIND + TURN + ON), KNOWN + BEHIND + TURN + ON
 
 
+@pytest.mark.slow
 def test_what_was_mapped_while_lost_comes_at_once_when_the_map_is_recognised(merged):
     slam, batches, poses = merged
     sizes = [len(batch) for batch in batches]
