@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tools.house import code_lines, constants, main
 
 MODULE = '''"""What it is for."""
