@@ -1,7 +1,5 @@
 """Small recordings of every kind, made on the spot."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Drawn chessboards, plain and with markers, seen by a stereo camera that is known exactly."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The command `segfloor` in tests: in a process of its own, or, much faster, in this one."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

@@ -1,7 +1,5 @@
 """As much of Nav2's ObstacleLayer as marks and clears (nav2_costmap_2d, obstacle_layer.cpp)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 FREE, LETHAL = 0, 254

@@ -1,7 +1,5 @@
 """Drawing textures at any number of positions, for tests that cast rays."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Follows nodes that run on two hosts from one of them: lets the camera play, and saves the map."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

@@ -1,7 +1,5 @@
 """A drive through the rendered room with something in it that moves, for tests."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

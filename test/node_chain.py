@@ -1,7 +1,5 @@
 """Nodes as processes of their own, fed frame by frame by the test, which plays the camera."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

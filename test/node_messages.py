@@ -1,7 +1,5 @@
 """Messages of a camera and of one keyframe for the nodes, and how they are sent."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A ROS graph inside the test process: nodes under test and a tester that talks to them."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os

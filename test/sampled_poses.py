@@ -1,7 +1,5 @@
 """Covariances compared with samples: along all axes, and in what the axes have in common."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from segfloor_ros.core.geometry import Array, invert

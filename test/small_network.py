@@ -2,8 +2,6 @@
 pictures of a simulated drive.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """A short drive through the textured room, written as a recording."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -4,8 +4,6 @@ The room is an axis-aligned box in `world` (ROS axes, floor at z = 0); every fac
 own smooth random texture.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

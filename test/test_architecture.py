@@ -1,7 +1,5 @@
 """The import rules of the package, read from the source."""
 
-from __future__ import annotations
-
 import ast
 import sys
 from collections.abc import Iterator

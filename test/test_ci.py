@@ -1,7 +1,5 @@
 """The project's own CI, and the files that docs/ci.md gives to copy."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import re

@@ -1,7 +1,5 @@
 """The handwritten pages name what there is."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import subprocess

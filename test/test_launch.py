@@ -2,8 +2,6 @@
 that run; and by `launch` itself where it is installed.
 """
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import itertools

@@ -1,7 +1,5 @@
 """The package as colcon and pip see it: description, and a real build in a scratch workspace."""
 
-from __future__ import annotations
-
 import ast
 import importlib.metadata
 import importlib.util

@@ -1,7 +1,5 @@
 """What README and docs/robot.md name, on a robot that has the packages of package.xml alone."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import os
 import re

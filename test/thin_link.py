@@ -4,8 +4,6 @@ This process carries the Ethernet frames from one to the other: it loses some, h
 while and lets only so many bits through a second. It needs no traffic control in the kernel.
 """
 
-from __future__ import annotations
-
 import fcntl
 import heapq
 import os

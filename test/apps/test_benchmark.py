@@ -1,7 +1,5 @@
 """The profile of `segfloor benchmark`, for real."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

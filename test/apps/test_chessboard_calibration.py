@@ -1,7 +1,5 @@
 """Calibration from drawn boards of a camera that is known exactly."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from pathlib import Path

@@ -2,8 +2,6 @@
 floor plan which it sees bit by bit.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import cv2

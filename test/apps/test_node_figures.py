@@ -1,7 +1,5 @@
 """`segfloor benchmark --nodes`: its sums by hand, the command for real."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

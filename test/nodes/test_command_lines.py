@@ -1,7 +1,5 @@
 """What the programs of the nodes make of their command lines, and of files that cannot be read."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """From `segfloor convert` to a pose: SLAM gets the messages of the bag, as a player sends them."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """What is wrong with a camera or a connection is said in words, with the topic and what to do."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import time

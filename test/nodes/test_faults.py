@@ -1,7 +1,5 @@
 """What cameras, links and foreign nodes do to the chain: it says so and maps on."""
 
-from __future__ import annotations
-
 import os
 import signal
 from dataclasses import replace

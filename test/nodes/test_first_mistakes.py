@@ -1,7 +1,5 @@
 """What somebody meets who starts the nodes for the first time: other topics, none, or twins."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

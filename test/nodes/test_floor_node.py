@@ -1,7 +1,5 @@
 """The node `floor_segmentation` over DDS, against its stage called directly."""
 
-from __future__ import annotations
-
 import numpy as np
 from node_messages import AT_ORIGIN, STAMP_NS, pose_message_at, publish, stereo_messages
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose

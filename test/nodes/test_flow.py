@@ -1,7 +1,5 @@
 """The declared topics against the running nodes, and the parameter files against them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Drivers, tf trees and parameter files of others: what comes of them is said with its remedy."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """What the processes of the nodes carry along."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from segfloor_ros.core.geometry import MAX_DISORDER_NS
 from segfloor_ros.nodes.shared.joining import Dropped, StampJoiner
 

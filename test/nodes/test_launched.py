@@ -1,7 +1,5 @@
 """The processes of the launch files, started with the command lines that `ros2 launch` makes."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What is shipped for other programs: layouts of RViz and Foxglove, parameters of Nav2."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

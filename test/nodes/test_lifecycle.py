@@ -1,7 +1,5 @@
 """The states of the nodes, driven over DDS as a lifecycle manager does."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from lifecycle_msgs.msg import State, Transition

@@ -1,7 +1,5 @@
 """What is lost on the way into a node is counted, named with its topic, and said."""
 
-from __future__ import annotations
-
 import re
 import time
 

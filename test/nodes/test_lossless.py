@@ -1,7 +1,5 @@
 """A camera that must lose nothing, and nodes that lose what they had in their queues."""
 
-from __future__ import annotations
-
 import pytest
 from stereo_drive import room_drive, write_kitti
 

@@ -2,8 +2,6 @@
 what is newest is soon among it.
 """
 
-from __future__ import annotations
-
 import pytest
 from stereo_drive import write_kitti
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose

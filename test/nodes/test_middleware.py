@@ -1,7 +1,5 @@
 """What the node processes ask of Fast DDS."""
 
-from __future__ import annotations
-
 import os
 import xml.etree.ElementTree as ET
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What moves, over DDS: masks that come in, and what the nodes tell of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

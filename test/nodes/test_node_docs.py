@@ -1,7 +1,5 @@
 """The pages of the nodes: as generated, and what they say against the running nodes."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import sys

@@ -1,7 +1,5 @@
 """Nodes receive images only while somebody needs what they make of them; time may stand still."""
 
-from __future__ import annotations
-
 import pytest
 from node_messages import STAMP_NS, grid_messages, publish
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 
 from segfloor_ros.nodes.stereo_camera import (

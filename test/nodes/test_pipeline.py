@@ -1,7 +1,5 @@
 """The five nodes in one program, of two processes."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """`segfloor replay` for real: five processes, a small drive, and what may go wrong."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Wheels, IMU and depth through `segfloor replay` and `convert`, against `segfloor run`."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

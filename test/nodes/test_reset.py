@@ -1,7 +1,5 @@
 """A map reset: by service, by a recording that is played again, by SLAM started again."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

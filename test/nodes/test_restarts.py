@@ -1,7 +1,5 @@
 """Each node killed without warning and started again in the middle of a drive."""
 
-from __future__ import annotations
-
 import os
 import time
 from dataclasses import replace

@@ -2,8 +2,6 @@
 their own services; the commands themselves are not among the wheels.
 """
 
-from __future__ import annotations
-
 import pytest
 import yaml
 from lifecycle_msgs.msg import State, Transition, TransitionEvent

@@ -1,7 +1,5 @@
 """Maps that the nodes save and load, over DDS: the whole chain in one process."""
 
-from __future__ import annotations
-
 import json
 from contextlib import suppress
 from functools import partial

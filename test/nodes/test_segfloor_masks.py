@@ -1,7 +1,5 @@
 """The node that runs a network: what it publishes, and that late masks reach their keyframe."""
 
-from __future__ import annotations
-
 import json
 import time
 

@@ -1,7 +1,5 @@
 """Wheel odometry and IMU over DDS: from a recording to poses of frames that show nothing."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The node of the simulated robot, over DDS, driven by the test."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Each node over DDS, against its stage called directly."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A stamp that is wrong is told from a clock that jumped."""
 
-from __future__ import annotations
-
 import pytest
 
 from segfloor_ros.nodes.shared.stamp_order import AGREEING, InTime, StampOrder

@@ -1,7 +1,5 @@
 """Real /tf and /tf_static between the process of `stereo_slam` and the test."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The nodes split over two hosts that a thin, lossy link joins."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """One wrong message is one wrong message: the map stays, and no node ends."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

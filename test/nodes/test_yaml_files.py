@@ -1,7 +1,5 @@
 """YAML files: their values, their lines, and what they may cost."""
 
-from __future__ import annotations
-
 import math
 import time
 

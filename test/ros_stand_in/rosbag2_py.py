@@ -1,7 +1,5 @@
 """As much of rosbag2_py as reads and writes bags, by rosbags: pip has no rosbag2_py."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`tools.ablation`: what is patched exists, and what is drawn, read and added is as said."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from stereo_drive import room_drive, write_kitti

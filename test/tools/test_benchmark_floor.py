@@ -1,7 +1,5 @@
 """`tools.benchmark_floor`: shares of the steps; disparities scored by hand."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """`tools.benchmark_nodes`: its drive to and fro, the command for real."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

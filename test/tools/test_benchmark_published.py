@@ -1,7 +1,5 @@
 """The published scenes: rendered once, mapped, scored, shown beside the published figures."""
 
-from __future__ import annotations
-
 import json
 import sys
 

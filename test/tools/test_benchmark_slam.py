@@ -1,7 +1,5 @@
 """`tools.benchmark_slam`: recordings with a known path, and scenes rendered once per seed."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A covariance that is true passes, one that is too small does not."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

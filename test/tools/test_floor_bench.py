@@ -1,7 +1,5 @@
 """Counts of masks worked out by hand, inputs that come back from disk, and scenes of low things."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """Scores of masks over depth and height, worked out by hand, and a simulated drive."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

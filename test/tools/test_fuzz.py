@@ -1,7 +1,5 @@
 """`tools.fuzz`: what it reports, and that nothing falls."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The size of the package, counted on a module of a few lines."""
 
-from __future__ import annotations
-
 import pytest
 
 from tools.house import code_lines, constants, main

@@ -1,7 +1,5 @@
 """The plain method places what is seen and nothing else, and rows say where SLAM does worse."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

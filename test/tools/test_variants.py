@@ -1,7 +1,5 @@
 """Variants of a recording are what they are called, and scored by the frames they are made of."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from stereo_drive import room_drive, write_kitti

@@ -1,7 +1,5 @@
 """The ROS domain of a replay is its own."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

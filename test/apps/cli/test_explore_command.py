@@ -1,7 +1,5 @@
 """`segfloor explore`: a closed loop over DDS, from an empty map to goals on the whole one."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

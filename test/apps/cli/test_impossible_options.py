@@ -1,7 +1,5 @@
 """Options with values that nothing can be done with: one line, status 2."""
 
-from __future__ import annotations
-
 import pytest
 from command_line import segfloor
 

@@ -1,7 +1,5 @@
 """`segfloor info` on real files."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

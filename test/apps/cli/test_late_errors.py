@@ -2,8 +2,6 @@
 interrupt. Real processes, real signals.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """`segfloor map edit`: what is drawn on the page, and what the command makes of it."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

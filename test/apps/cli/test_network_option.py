@@ -1,7 +1,5 @@
 """`--network` of run and replay, for real: a network beside a small drive, and wrong ones."""
 
-from __future__ import annotations
-
 import json
 from importlib.util import find_spec
 

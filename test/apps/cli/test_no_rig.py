@@ -1,7 +1,5 @@
 """Two cameras that are not on one mount end a run with one line."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -2,8 +2,6 @@
 of every kind, by every form of collision.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

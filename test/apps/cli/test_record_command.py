@@ -1,7 +1,5 @@
 """`segfloor record`: topics of a live graph, and a camera of this machine."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

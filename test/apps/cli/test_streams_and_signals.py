@@ -1,7 +1,5 @@
 """The command line with impossible names, outputs and signals: one line, and no traceback."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """What `--view` and `segfloor view` write, read back by the reader of rerun."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

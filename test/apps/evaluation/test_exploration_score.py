@@ -1,7 +1,5 @@
 """Figures of an exploration, worked out by hand, in a map whose frame lies elsewhere and turned."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Maps and trajectories as other programs write them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

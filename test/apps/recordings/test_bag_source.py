@@ -1,7 +1,5 @@
 """Bags of all formats and encodings, their topics, and what is wrong with bad ones."""
 
-from __future__ import annotations
-
 import builtins
 import logging
 from collections.abc import Callable, Sequence

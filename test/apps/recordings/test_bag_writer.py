@@ -1,7 +1,5 @@
 """Round trips through the bags that we write."""
 
-from __future__ import annotations
-
 import dataclasses
 import subprocess
 import sys

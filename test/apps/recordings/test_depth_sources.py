@@ -1,7 +1,5 @@
 """Depth images in place of right ones: folders, the TUM RGB-D benchmark, bags; and their faults."""
 
-from __future__ import annotations
-
 import re
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """KITTI, EuRoC and image folders: order, stamps, pixels, and what is wrong with bad ones."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 from pathlib import Path

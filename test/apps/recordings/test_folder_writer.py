@@ -1,7 +1,5 @@
 """Round trips through the folders that we write: KITTI and TUM RGB-D."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

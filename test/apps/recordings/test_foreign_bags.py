@@ -1,7 +1,5 @@
 """Bags as other recorders and tools leave them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Folders as other benchmarks and tools lay them out, and the units they use."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """One rig in the files of other tools: each gives the same rectified camera."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

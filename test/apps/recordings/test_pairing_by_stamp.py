@@ -1,7 +1,5 @@
 """Pairing of two streams by stamp, on sequences written by hand (milliseconds)."""
 
-from __future__ import annotations
-
 import logging
 
 import pytest

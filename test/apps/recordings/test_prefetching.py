@@ -1,7 +1,5 @@
 """Reading ahead: order, errors, and the end of the thread."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from itertools import islice

@@ -1,7 +1,5 @@
 """The recordings beside the repository: counts, stamps, pixels and epipolar lines."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

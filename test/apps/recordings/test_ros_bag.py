@@ -1,7 +1,5 @@
 """Bags read and written by rosbag2_py against the same bags by rosbags."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Wheel odometry and IMU of folders, EuRoC sequences and bags: what is read, and bad files."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

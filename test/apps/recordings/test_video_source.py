@@ -1,7 +1,5 @@
 """Side-by-side videos."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

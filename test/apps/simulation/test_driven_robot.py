@@ -1,7 +1,5 @@
 """The robot in MuJoCo: it drives as told and as its wheels let it, and feels what it runs into."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 
 import numpy as np

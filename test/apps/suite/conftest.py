@@ -1,7 +1,5 @@
 """A recording with its truth, small enough to be mapped several times."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`segfloor check` for real, on a drive through a generated room."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

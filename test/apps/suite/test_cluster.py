@@ -1,7 +1,5 @@
 """A suite on worker processes, of this machine and of Dask."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

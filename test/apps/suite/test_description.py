@@ -1,7 +1,5 @@
 """Suites as their files describe them, and every way in which a file can be wrong."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Drives of a suite in order, each in the map of the last."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a worker of a check starts ends with it."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

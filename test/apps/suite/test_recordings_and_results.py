@@ -1,7 +1,5 @@
 """Recordings by URL, their digests, and results that are packed and kept."""
 
-from __future__ import annotations
-
 import io
 import tarfile
 

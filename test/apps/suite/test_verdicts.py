@@ -1,7 +1,5 @@
 """Bounds, baselines, JUnit and the page: worked out by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from junitparser import JUnitXml

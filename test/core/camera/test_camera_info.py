@@ -1,7 +1,5 @@
 """What the fields of a CameraInfo mean, by its message definition."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

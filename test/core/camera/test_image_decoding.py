@@ -1,7 +1,5 @@
 """Decoding of raw and compressed images; expected greys by hand (ITU-R BT.601 weights)."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import cv2

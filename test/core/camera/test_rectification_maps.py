@@ -1,7 +1,5 @@
 """Rectified images against the picture that an ideal camera would have taken."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

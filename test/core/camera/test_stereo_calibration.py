@@ -1,7 +1,5 @@
 """Calibrations of all models and files, checked by projecting points with independent means."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Results are written in one step, and nothing of others is replaced, removed or followed."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

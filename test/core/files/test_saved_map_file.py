@@ -1,7 +1,5 @@
 """Maps on disk: round trips, and files that are not what they should be."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

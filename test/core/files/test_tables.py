@@ -1,7 +1,5 @@
 """Numbers and stamps in text."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

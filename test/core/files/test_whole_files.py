@@ -1,7 +1,5 @@
 """Files that are read whole: what is no file, too large or no text is refused in one line."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """What clears a costmap: the free ranges of a frame, and Nav2's rules applied to them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Flat worlds of discs and walls, seen by an ideal floor scan."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

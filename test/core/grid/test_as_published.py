@@ -1,7 +1,5 @@
 """The published mapper on cases worked out by hand: rays, layers, outliers and limits."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from conftest import path_of

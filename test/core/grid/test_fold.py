@@ -1,7 +1,5 @@
 """Where the evidence of one keyframe lies in the cells, from a pose that is not the origin."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

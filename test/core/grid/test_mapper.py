@@ -1,7 +1,5 @@
 """The map follows the keyframes; its raster, settings and limits."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The map of small worlds that change, leak and hold thin things."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

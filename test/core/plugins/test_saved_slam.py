@@ -1,7 +1,5 @@
 """A map that is saved, loaded, localized in, and mapped on."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A drive that is broken off, as when its node is killed, and goes on some seconds later."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """How far odometry says that it has gone astray, compared with sampled paths, on a turn."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Each mechanism at work in the whole SLAM stage, where a drive needs it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hand_made_maps import row_of_views

@@ -1,7 +1,5 @@
 """What a keyframe holds of what moves."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

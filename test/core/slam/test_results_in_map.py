@@ -1,7 +1,5 @@
 """Results leave SLAM in ROS frames: the base on its mount, with the covariance of its pose."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

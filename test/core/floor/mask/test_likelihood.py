@@ -1,7 +1,5 @@
 """What the features of a pixel say, and what becomes of a mask."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

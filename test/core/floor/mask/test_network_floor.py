@@ -1,7 +1,5 @@
 """What a network says of the floor, beside what is measured."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from floor_scenes import SMALL_CAMERA, Scene, floor_patch, wall

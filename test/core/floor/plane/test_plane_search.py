@@ -1,7 +1,5 @@
 """What an accelerometer adds to the search for the floor's plane."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

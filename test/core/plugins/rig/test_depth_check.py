@@ -1,7 +1,5 @@
 """Depth that does not belong to its image shows at the edges."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

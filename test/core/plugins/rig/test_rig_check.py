@@ -1,7 +1,5 @@
 """What is wrong with a stereo rig shows in its images, within fifty frames."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice, pairwise

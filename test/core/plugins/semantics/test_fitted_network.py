@@ -1,7 +1,5 @@
 """From true labels to a map: a network is fitted to a simulated drive, and sees another one."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from command_line import segfloor_process

@@ -1,7 +1,5 @@
 """Labels of points and cells: the likeliest class, where the keyframes lie now, and its files."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from command_line import segfloor

@@ -1,7 +1,5 @@
 """A network beside a drive: which frames it looks at, and when it is not believed."""
 
-from __future__ import annotations
-
 import logging
 
 import cv2

@@ -1,7 +1,5 @@
 """Networks from files: what they see, and one line for those that are no such files."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import SimpleNamespace

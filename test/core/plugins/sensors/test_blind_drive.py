@@ -1,7 +1,5 @@
 """A drive through a rendered room that the camera does not see for a while."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

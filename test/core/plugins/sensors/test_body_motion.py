@@ -1,7 +1,5 @@
 """What wheels and gyroscope measure of the motion between frames, in cases worked out by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

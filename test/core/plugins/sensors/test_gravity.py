@@ -1,7 +1,5 @@
 """Where up is, from what an accelerometer measures on a drive that speeds up, brakes and turns."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """A camera that sees nothing is carried on by what an accelerometer measures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

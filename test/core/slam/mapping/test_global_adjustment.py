@@ -1,7 +1,5 @@
 """The whole map, adjusted after it was bent, and brought back into one that has grown since."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

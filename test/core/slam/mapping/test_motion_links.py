@@ -1,7 +1,5 @@
 """Measured motions between keyframes in a bundle adjustment."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from types import SimpleNamespace
 

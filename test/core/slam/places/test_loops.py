@@ -1,7 +1,5 @@
 """Loops: found, verified and closed in a room whose map was bent on purpose."""
 
-from __future__ import annotations
-
 import threading
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Visual words and the index of places."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

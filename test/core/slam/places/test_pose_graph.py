@@ -1,7 +1,5 @@
 """The pose graph on rings of poses whose truth is known."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,7 +1,5 @@
 """A camera that got lost, maps on its own, and recognises the map again."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose

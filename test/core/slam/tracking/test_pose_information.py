@@ -1,7 +1,5 @@
 """How well points determine the pose, in images drawn for it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
