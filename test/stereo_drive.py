@@ -4,7 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from stereo_room import CAMERA, StereoRoom, planar_pose
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.core.contracts import StereoFrame
@@ -13,6 +13,12 @@ from segfloor_ros.core.plugins.assembly import make_pipeline
 from segfloor_ros.nodes.configuration import resolve
 
 RATE_HZ = 10.0
+KNOWN_MOUNT = [
+    word
+    for name in ('height_m', 'pitch_rad', 'roll_rad')
+    for word in ('--set', f'stereo_slam.camera_{name}={getattr(MOUNT, name)}')
+]
+"""The mount of the camera as options of a command."""
 
 
 def room_drive(

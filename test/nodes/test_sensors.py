@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from node_messages import MOUNTED
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 from stereo_drive import room_drive, write_kitti
@@ -44,22 +45,27 @@ def drive(tmp_path):
     return folder, poses
 
 
-def test_frames_that_show_nothing_have_the_pose_of_the_wheels(make_graph, drive) -> None:
-    folder, poses = drive
-    arguments = [
-        *('-p', f'input:={folder}', '-p', 'rate:=0.0', '-p', 'background:=false'),
-        *('-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}'),
-        *('-p', f'camera_roll_rad:={MOUNT.roll_rad}'),
-    ]
-    graph = make_graph(*arguments)
-    odometry = graph.collect('odometry')
-    graph.add(StereoSlamNode())
-    graph.add(make_stereo_camera())
-    graph.until(lambda: len(odometry) == FRAMES, 'the odometry of every frame')
+def played(folder: Path, rate: float = 0.0) -> tuple[str, ...]:
+    """Return the arguments of nodes for a recording."""
+    return '-p', f'input:={folder}', '-p', f'rate:={rate}', '-p', 'background:=false'
+
+
+def assert_true(odometry, poses) -> None:
+    """Each pose must be the true one."""
     for message in odometry:
         truth = invert(poses[0]) @ poses[round(to_ns(message.header.stamp) * 1e-8)]
         error = invert(truth) @ pose_array(message.pose.pose)
         assert np.linalg.norm(error[:3, 3]) < 0.02
+
+
+def test_frames_that_show_nothing_have_the_pose_of_the_wheels(make_graph, drive) -> None:
+    folder, poses = drive
+    graph = make_graph(*played(folder), *MOUNTED)
+    odometry = graph.collect('odometry')
+    graph.add(StereoSlamNode())
+    graph.add(make_stereo_camera())
+    graph.until(lambda: len(odometry) == FRAMES, 'the odometry of every frame')
+    assert_true(odometry, poses)
     sigma_m = [np.sqrt(message.pose.covariance[0]) for message in odometry]
     assert min(sigma_m[k] for k in BLIND) > 2 * sigma_m[5]
 
@@ -74,12 +80,7 @@ def test_where_the_imu_of_a_recording_is_comes_through_tf(make_graph, drive) -> 
     (folder / 'imu.yaml').write_text(
         f'T_BS: {{rows: 4, cols: 4, data: {T_left_imu.ravel().tolist()}}}'
     )
-    arguments = [
-        *('-p', f'input:={folder}', '-p', 'rate:=1.0', '-p', 'background:=false'),
-        *('-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}'),
-        *('-p', f'camera_roll_rad:={MOUNT.roll_rad}'),
-    ]
-    graph = make_graph(*arguments)
+    graph = make_graph(*played(folder, 1.0), *MOUNTED)
     slam = graph.add(StereoSlamNode())
     graph.add(make_stereo_camera())
 
@@ -99,12 +100,7 @@ def test_where_no_topic_tells_the_odometry_that_another_node_broadcasts_is_taken
     folder, poses = drive
     (folder / 'wheel_odometry.txt').unlink()
     monkeypatch.setattr('segfloor_ros.nodes.slam_sensors.DISCOVERY_S', 0.0)
-    arguments = [
-        *('-p', f'input:={folder}', '-p', 'rate:=0.0', '-p', 'background:=false'),
-        *('-p', 'publish_odom_tf:=false', '-p', f'camera_height_m:={MOUNT.height_m}'),
-        *('-p', f'camera_pitch_rad:={MOUNT.pitch_rad}', '-p', f'camera_roll_rad:={MOUNT.roll_rad}'),
-    ]
-    graph = make_graph(*arguments)
+    graph = make_graph(*played(folder), *MOUNTED, '-p', 'publish_odom_tf:=false')
     odometry = graph.collect('odometry')
     tf_msgs = pytest.importorskip('tf2_msgs.msg')
     slam = graph.add(StereoSlamNode())
@@ -116,10 +112,7 @@ def test_where_no_topic_tells_the_odometry_that_another_node_broadcasts_is_taken
     others.publish(tf_msgs.TFMessage(transforms=told))
     graph.add(make_stereo_camera())
     graph.until(lambda: len(odometry) == FRAMES, 'the odometry of every frame')
-    for message in odometry:
-        truth = invert(poses[0]) @ poses[round(to_ns(message.header.stamp) * 1e-8)]
-        error = invert(truth) @ pose_array(message.pose.pose)
-        assert np.linalg.norm(error[:3, 3]) < 0.02
+    assert_true(odometry, poses)
     assert slam.slam.sensors.messages['wheel_odometry'] >= FRAMES - 2
 
 
@@ -263,22 +256,14 @@ def test_depth_images_take_the_place_of_right_ones_that_nobody_publishes(
     make_graph, depth_drive
 ) -> None:
     folder, poses = depth_drive
-    arguments = [
-        *('-p', f'input:={folder}', '-p', 'depth:=true', '-p', 'rate:=0.0'),
-        *('-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}'),
-        *('-p', f'camera_roll_rad:={MOUNT.roll_rad}', '-p', 'background:=false'),
-    ]
-    graph = make_graph(*arguments)
+    graph = make_graph(*played(folder), *MOUNTED, '-p', 'depth:=true')
     odometry, right = graph.collect('odometry'), graph.collect('keyframe/right/image_rect')
     masks, scans = graph.collect('keyframe/floor_mask'), graph.collect('scan')
     graph.add(StereoSlamNode())
     graph.add(FloorSegmentationNode())
     graph.add(make_stereo_camera())
     graph.until(lambda: len(odometry) == 8 and masks and scans, 'odometry and floor')
-    for message in odometry:
-        truth = invert(poses[0]) @ poses[round(to_ns(message.header.stamp) * 1e-8)]
-        error = invert(truth) @ pose_array(message.pose.pose)
-        assert np.linalg.norm(error[:3, 3]) < 0.02
+    assert_true(odometry, poses)
     disparity = right_image(right[0], 'keyframe/right/image_rect')
     assert disparity.dtype == np.float32
     # The floor fills the lowest rows of the picture.

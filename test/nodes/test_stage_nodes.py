@@ -255,27 +255,6 @@ class TestStereoSlam:
         graph.until(lambda: poses, 'the first pose')
         assert [to_ns(message.header.stamp) for message in poses] == [frames[0].stamp_ns]
 
-    def test_broken_and_lonely_images_are_named_and_the_node_lives(self, make_graph) -> None:
-        frames, _ = room_drive(4)
-        graph = make_graph(*MOUNTED)
-        graph.add(StereoSlamNode())
-        inputs = self.inputs(graph)
-        self.send(inputs, frames[0])
-        broken = image_message(frames[1].stamp_ns, 'left', frames[1].left)
-        broken.encoding = '64FC7'
-        inputs['left/image_raw'].publish(broken)
-        inputs['right/image_raw'].publish(
-            image_message(frames[1].stamp_ns, 'right', frames[1].right)
-        )
-        self.send(inputs, frames[2], sides=('left',))
-        self.send(inputs, frames[3])
-        graph.until(lambda: len(graph.reports('stereo_slam')) == 4, 'four statuses')
-        by_stamp = {s.stamp_ns: s for s in graph.reports('stereo_slam')}
-        assert 'left/image_raw' in by_stamp[frames[1].stamp_ns].message
-        assert '64FC7' in by_stamp[frames[1].stamp_ns].message
-        assert 'no message on right/image_raw' in by_stamp[frames[2].stamp_ns].message
-        assert by_stamp[frames[3].stamp_ns].level is Level.OK
-
     def _wait_for_outputs(self, graph) -> None:
         def connected() -> bool:
             seen = [s for s in graph.statuses if s.kind == 'connections']

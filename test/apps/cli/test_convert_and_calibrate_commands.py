@@ -18,7 +18,6 @@ from chessboards import (
 from command_line import segfloor
 from stereo_drive import room_drive, write_kitti
 
-import segfloor_ros
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.calibration_files import read_calibration
 from segfloor_ros.core.camera.settings import StereoCameraSettings
@@ -50,20 +49,6 @@ def test_a_part_of_a_recording_is_converted(tmp_path):
     part = list(open_source(StereoCameraSettings(input=str(out))).raw_pairs())
     assert [pair.stamp_ns for pair in part] == [whole[1].stamp_ns, whole[3].stamp_ns]
     np.testing.assert_array_equal(part[1].left, whole[3].left)
-
-
-def test_the_version_is_that_of_the_package():
-    done = segfloor('--version')
-    assert done.stdout == f'segfloor_ros {segfloor_ros.__version__}\n'
-
-
-def test_convert_does_not_overwrite(tmp_path):
-    folder = write_kitti(tmp_path / 'drive', room_drive(2)[0])
-    (tmp_path / 'drive.mcap').write_text('precious')
-    done = segfloor('convert', folder, tmp_path / 'drive.mcap')
-    assert done.returncode == 2
-    assert 'exists already' in done.stderr
-    assert (tmp_path / 'drive.mcap').read_text() == 'precious'
 
 
 def test_calibrate_writes_what_the_reader_reads(tmp_path):
@@ -133,12 +118,6 @@ def test_calibrate_takes_boards_with_markers(tmp_path):
     assert done.returncode == 0, done.stderr
     assert '5 of 6' in done.stdout
     assert 'left out: 1 cannot be read (first: ' in done.stderr
-
-
-def test_calibrate_refuses_a_board_in_no_form(tmp_path):
-    done = segfloor('calibrate', tmp_path, '--square', 0.03, '--board', 'nine')
-    assert done.returncode == 2
-    assert '--board nine' in done.stderr
 
 
 def test_calibrate_checks_a_recording(tmp_path):

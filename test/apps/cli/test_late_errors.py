@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import segfloor
-from stereo_drive import room_drive, write_kitti
-from stereo_room import MOUNT
+from stereo_drive import KNOWN_MOUNT, room_drive, write_kitti
 
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.bag_writer import convert
@@ -32,11 +31,6 @@ from segfloor_ros.core.plugins.sensors.body_motion import is_sound
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 
 FRAMES = 30
-KNOWN_MOUNT = [
-    word
-    for name in ('height_m', 'pitch_rad', 'roll_rad')
-    for word in ('--set', f'stereo_slam.camera_{name}={getattr(MOUNT, name)}')
-]
 
 
 @pytest.fixture(scope='module')

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from command_line import segfloor, segfloor_process
 from small_network import constant_network, grey_network
-from stereo_drive import room_drive, write_kitti
-from stereo_room import MOUNT
+from stereo_drive import KNOWN_MOUNT, room_drive, write_kitti
 
 from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.core.contracts import FLOOR
@@ -17,13 +16,6 @@ from segfloor_ros.core.grid.occupancy import FREE, UNKNOWN
 
 FRAMES = 16
 CLASSES = ('person', 'floor')
-WITH_MOUNT = [
-    part
-    for name, value in (
-        ('height_m', MOUNT.height_m), ('pitch_rad', MOUNT.pitch_rad), ('roll_rad', MOUNT.roll_rad)
-    )
-    for part in ('--set', f'stereo_slam.camera_{name}={value}')
-]  # fmt: skip
 
 
 @pytest.fixture(scope='module')
@@ -38,7 +30,7 @@ def test_with_a_wrong_network_tracking_goes_on_and_it_is_said(tmp_path, drive, c
     roles = {'moves': ['person'], 'floor': ['floor']}
     network = constant_network(tmp_path / 'wrong.onnx', chosen, CLASSES, **roles)
     out = tmp_path / 'out'
-    done = segfloor_process('run', drive, '--network', network, '--out', out, *WITH_MOUNT)
+    done = segfloor_process('run', drive, '--network', network, '--out', out, *KNOWN_MOUNT)
     assert done.returncode == 0, done.stderr
     summary = json.loads((out / 'summary.json').read_text())
     assert summary['tracked_frames'] == FRAMES
@@ -64,7 +56,7 @@ def test_what_moves_leaves_features_and_floor_even_if_the_network_sees_keyframes
     """What is dark is said to move: it stays out of the floor masks."""
     network = grey_network(tmp_path / 'n.onnx', 160, 120, moves=['dark'], every=0, mean=[100.0])
     out = tmp_path / 'out'
-    done = segfloor_process('run', drive, '--network', network, '--out', out, *WITH_MOUNT)
+    done = segfloor_process('run', drive, '--network', network, '--out', out, *KNOWN_MOUNT)
     assert done.returncode == 0, done.stderr
     summary = json.loads((out / 'summary.json').read_text())
     assert summary['stages']['network']['count'] == summary['keyframes'] < FRAMES
@@ -91,7 +83,7 @@ def test_a_saved_map_keeps_its_classes(tmp_path, drive):
     network = constant_network(tmp_path / 'n.onnx', 'floor', CLASSES, floor=['floor'])
     saved, again, out = (tmp_path / name for name in ('a.map', 'b.map', 'out'))
     words = ('--network', network, '--save-map', saved)
-    assert segfloor_process('run', drive, '--out', out, *words, *WITH_MOUNT).returncode == 0
+    assert segfloor_process('run', drive, '--out', out, *words, *KNOWN_MOUNT).returncode == 0
     facts = json.loads(segfloor('map', 'info', saved, '--json').stdout)
     assert facts['classes_m2'] == {'floor': pytest.approx(facts['free_m2'], rel=0.5)}
     assert 'floor' in segfloor('map', 'info', saved).stdout
@@ -101,7 +93,7 @@ def test_a_saved_map_keeps_its_classes(tmp_path, drive):
     assert (tmp_path / 'e_semantic.png').is_file()
     # It goes on without a network.
     words = ('--load-map', saved, '--save-map', again)
-    done = segfloor_process('run', drive, '--out', tmp_path / 'later', *words, *WITH_MOUNT)
+    done = segfloor_process('run', drive, '--out', tmp_path / 'later', *words, *KNOWN_MOUNT)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / 'later' / 'map_semantic.png').is_file()
     assert json.loads(segfloor('map', 'info', again, '--json').stdout)['classes_m2'].keys() == {
@@ -116,7 +108,7 @@ def test_replay_runs_the_network_beside_the_five_nodes(tmp_path, drive):
     network = constant_network(tmp_path / 'n.onnx', 'floor', CLASSES, **roles)
     out = tmp_path / 'out'
     done = segfloor_process(
-        'replay', drive, '--network', network, '--rate', '0', '--out', out, *WITH_MOUNT
+        'replay', drive, '--network', network, '--rate', '0', '--out', out, *KNOWN_MOUNT
     )
     assert done.returncode == 0, done.stderr
     summary = json.loads((out / 'summary.json').read_text())

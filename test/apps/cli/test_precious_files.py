@@ -13,17 +13,10 @@ import numpy as np
 import pytest
 from chessboards import write_boards
 from command_line import segfloor
-from stereo_drive import room_drive, write_kitti
-from stereo_room import MOUNT
+from stereo_drive import KNOWN_MOUNT, room_drive, write_kitti
 
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.nodes.map_files import save_map
-
-KNOWN_MOUNT = [
-    word
-    for name in ('height_m', 'pitch_rad', 'roll_rad')
-    for word in ('--set', f'stereo_slam.camera_{name}={getattr(MOUNT, name)}')
-]
 
 PRECIOUS = {
     'notes.txt': b'written by segfloor? no, by me',

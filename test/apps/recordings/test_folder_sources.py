@@ -54,12 +54,6 @@ def test_kitti_pairs_come_as_they_are(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.right, right)
 
 
-def test_sources_can_be_read_again(tmp_path: Path) -> None:
-    source = opened(write_kitti(tmp_path, grey_pairs(3)))
-    first, second = left_images(source), left_images(source)
-    np.testing.assert_array_equal(first, second)
-
-
 def test_kitti_stamps_are_exact_in_nanoseconds(tmp_path: Path) -> None:
     folder = write_kitti(tmp_path, grey_pairs(2))
     (folder / 'times.txt').write_text('1403715273.262142976\n1.403715273312143104e+09\n')
@@ -198,13 +192,6 @@ def test_euroc_images_without_partner_are_left_out(
         source = opened(folder)
     assert [frame.stamp_ns for frame in source.frames()] == [0, 100 * MS, 150 * MS]
     assert '1 and 0 images have no partner' in caplog.text
-
-
-def test_euroc_without_index_takes_the_names(tmp_path: Path) -> None:
-    folder = write_euroc(tmp_path, grey_pairs(2), [5, 50 * MS], [5, 50 * MS])
-    for camera in ('cam0', 'cam1'):
-        (folder / 'mav0' / camera / 'data.csv').unlink()
-    assert [frame.stamp_ns for frame in opened(folder).frames()] == [5, 50 * MS]
 
 
 def truncate(path: Path) -> None:
