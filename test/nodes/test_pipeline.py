@@ -144,7 +144,10 @@ def test_when_one_process_is_killed_the_other_one_ends(victim, tmp_path) -> None
     assert status == (-signal.SIGKILL if victim == 'SLAM' else 128 + signal.SIGKILL)
 
 
-@pytest.mark.parametrize('parameter', ['input:=nowhere', 'num_featurs:=3', 'num_features:=-1'])
+@pytest.mark.parametrize(
+    'parameter',
+    ['input:=nowhere', 'num_featurs:=3', pytest.param('num_features:=-1', marks=pytest.mark.slow)],
+)
 def test_a_mistake_of_any_node_ends_it_with_one_line(parameter) -> None:
     with surroundings():
         words = (*PIPELINE, '--ros-args', '-p', parameter)

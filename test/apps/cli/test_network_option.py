@@ -24,7 +24,11 @@ def drive(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ('chosen', 'words'), [('person', '100 % of an image are of classes that move'), ('floor', '')]
+    ('chosen', 'words'),
+    [
+        ('person', '100 % of an image are of classes that move'),
+        pytest.param('floor', '', marks=pytest.mark.slow),
+    ],
 )
 def test_with_a_wrong_network_tracking_goes_on_and_it_is_said(tmp_path, drive, chosen, words):
     roles = {'moves': ['person'], 'floor': ['floor']}

@@ -95,7 +95,7 @@ with BagWriter(Path(sys.argv[2]), source.calibration, ImageCoding.raw, keeps=Tru
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('name', ['out.mcap', 'out'])
+@pytest.mark.parametrize('name', ['out.mcap', pytest.param('out', marks=pytest.mark.slow)])
 def test_what_a_killed_recorder_wrote_is_read(tmp_path, name) -> None:
     """The file or folder is there by its name from the beginning."""
     pytest.importorskip('rosbags')

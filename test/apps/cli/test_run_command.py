@@ -142,7 +142,7 @@ def test_masks_show_floor_low_and_none_above_the_horizon(result):
 
 
 def test_a_second_run_gives_the_same_bytes(recording, result, tmp_path):
-    again = segfloor_process(
+    again = segfloor(
         'run', recording, '--out', tmp_path / 'out', '--save-masks', 'none', *KNOWN_MOUNT
     )
     assert again.returncode == 0, again.stderr

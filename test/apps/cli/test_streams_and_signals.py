@@ -99,7 +99,13 @@ SLOW_IMPORT = (
 )
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    'number',
+    [
+        signal.SIGINT,
+        *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGHUP)),
+    ],
+)
 @pytest.mark.parametrize(
     ('start', 'status'),
     [(START, None), ('from segfloor_ros.apps.programs import stereo_slam; stereo_slam()', 0)],

@@ -93,8 +93,13 @@ def test_the_demo_runs_and_scores_the_map_without_extras(tmp_path):
     ('words', 'package', 'installed'),
     [
         (('check', 'suite.yaml', '--out', 'out'), 'junitparser', 'junitparser'),
-        (('evaluate', 'trajectory', 'a.txt', 'b.txt'), 'evo', "'segfloor_ros[evaluate]'"),
-        (('view', 'room'), 'rerun', "'segfloor_ros[view]'"),
+        *(
+            pytest.param(words, package, f"'segfloor_ros[{extra}]'", marks=pytest.mark.slow)
+            for words, package, extra in (
+                (('evaluate', 'trajectory', 'a.txt', 'b.txt'), 'evo', 'evaluate'),
+                (('view', 'room'), 'rerun', 'view'),
+            )
+        ),
         (('simulate', 'lane', '--out', 'out'), 'MuJoCo', "'segfloor_ros[sim]'"),
     ],
 )

@@ -178,6 +178,7 @@ def test_a_killed_worker_changes_nothing(room, alone, tmp_path):
     assert_same_maps(alone, tmp_path / 'two')
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_not_there_is_one_line(room, tmp_path):
     check = start_check(room, tmp_path, '--out', str(tmp_path / 'out'), '--scheduler', 'nowhere')
     _, errors = check.communicate(timeout=120)
