@@ -151,49 +151,30 @@ def test_compressed_images_are_decoded(
 @pytest.mark.parametrize(
     ('topics', 'expected'),
     [
-        (['/left/image_raw', '/right/image_raw'], '/left/image_raw'),
-        (['/a/left/image_raw', '/a/right/image_raw', '/b/left/image_rect'], '/a/left/image_raw'),
+        ('/left/image_raw /right/image_raw', '/left/image_raw'),
+        ('/a/left/image_raw /a/right/image_raw /b/left/image_rect', '/a/left/image_raw'),
+        ('/left/image_raw /right/image_raw /left/image_rect /right/image_rect', '/left/image_rect'),
         (
-            ['/left/image_raw', '/right/image_raw', '/left/image_rect', '/right/image_rect'],
-            '/left/image_rect',
-        ),
-        (
-            [
-                '/camera/infra1/image_rect_raw',
-                '/camera/infra2/image_rect_raw',
-                '/camera/depth/image_rect_raw',
-                '/camera/color/image_raw',
-            ],
+            '/camera/infra1/image_rect_raw /camera/infra2/image_rect_raw '
+            '/camera/depth/image_rect_raw /camera/color/image_raw',
             '/camera/infra1/image_rect_raw',
         ),
+        ('/left/image_raw/compressed /right/image_raw/compressed', '/left/image_raw/compressed'),
         (
-            ['/left/image_raw/compressed', '/right/image_raw/compressed'],
-            '/left/image_raw/compressed',
-        ),
-        (
-            [
-                '/left/image_color/compressed',
-                '/right/image_color/compressed',
-                '/left/image_color',
-                '/right/image_color',
-            ],
+            '/left/image_color/compressed /right/image_color/compressed '
+            '/left/image_color /right/image_color',
             '/left/image_color',
         ),
-        (['/cam0/image_raw', '/cam1/image_raw'], '/cam0/image_raw'),
+        ('/cam0/image_raw /cam1/image_raw', '/cam0/image_raw'),
         (
-            [
-                '/keyframe/left/image_rect',
-                '/keyframe/right/image_rect',
-                '/left/image_raw',
-                '/right/image_raw',
-            ],
+            '/keyframe/left/image_rect /keyframe/right/image_rect /left/image_raw /right/image_raw',
             '/left/image_raw',
         ),
-        (['/stereo_left', '/stereo_right'], '/stereo_left'),
+        ('/stereo_left /stereo_right', '/stereo_left'),
     ],
 )
-def test_stereo_topics_are_found_by_name(topics: list[str], expected: str) -> None:
-    types = {t: COMPRESSED if t.endswith('compressed') else IMAGE for t in topics}
+def test_stereo_topics_are_found_by_name(topics: str, expected: str) -> None:
+    types = {t: COMPRESSED if t.endswith('compressed') else IMAGE for t in topics.split()}
     assert find_topics('bag', types, '', '').left == expected
 
 
