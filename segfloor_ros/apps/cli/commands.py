@@ -25,7 +25,7 @@ from segfloor_ros.apps.lockstep import LockstepRun, SaveMasks
 from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.results_folder import OutputFolder
 from segfloor_ros.core.errors import MapError, SettingsError, about
-from segfloor_ros.core.files.writing import add_files
+from segfloor_ros.core.files.writing import add_files, check_target
 from segfloor_ros.core.processes import Interrupt, first_interrupt_noted
 from segfloor_ros.nodes.network_files import open_network
 from segfloor_ros.nodes.settings.camera import StereoCameraNodeSettings
@@ -317,10 +317,16 @@ def simulate(
     """
     # Imported here: the simulator takes time that other commands should not wait for.
     from segfloor_ros.apps.simulation.scene_file import open_scene
-    from segfloor_ros.apps.simulation.simulation import RecordingOptions, Simulation, record
+    from segfloor_ros.apps.simulation.simulation import (
+        RECORDED,
+        RecordingOptions,
+        Simulation,
+        record,
+    )
 
     kind = [f'camera.kind={camera}'] if camera is not None else []
     described = open_scene(scene, [*kind, *(set_values or ())])
+    check_target(out, RECORDED)  # before the scene is built, which takes a second
     wanted = RecordingOptions(floor_every, disparity, labels)
     with (
         about(scene),
