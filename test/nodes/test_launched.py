@@ -25,7 +25,8 @@ def parameter(graph, node: str, name: str):
     return found
 
 
-@pytest.mark.parametrize('composed', ['false', pytest.param('true', marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize('composed', ['false', 'true'])
 def test_the_nodes_are_as_the_arguments_say(make_graph, monkeypatch, tmp_path, composed) -> None:
     monkeypatch.setitem(launch_stand_in.SHARE, 'segfloor_ros', LAUNCH.parents[1])
     drive = write_kitti(tmp_path / "the drive's", room_drive(2)[0])

@@ -253,8 +253,9 @@ def make(folder: Path) -> Path:
 
 
 def test_depth_images_take_the_place_of_right_ones_that_nobody_publishes(
-    make_graph, depth_drive
+    make_graph, depth_drive, monkeypatch
 ) -> None:
+    monkeypatch.setattr(slam_camera, 'DISCOVERY_S', 0.5)
     folder, poses = depth_drive
     graph = make_graph(*played(folder), *MOUNTED, '-p', 'depth:=true')
     odometry, right = graph.collect('odometry'), graph.collect('keyframe/right/image_rect')

@@ -136,6 +136,7 @@ def test_without_publish_tf_nothing_is_broadcast(start, drive) -> None:
     assert not chain.graph.comes(lambda: tf.moving or tf.fixed, 0.3)
 
 
+@pytest.mark.slow
 def test_a_mount_on_tf_is_that_of_the_parameters(start, drive) -> None:
     """Over two links, as a camera's body stands between the base and its optical frame."""
     frames, _ = drive

@@ -53,6 +53,7 @@ def test_a_damage_repeats(tmp_path, name):
     assert left[0] == left[1]
 
 
+@pytest.mark.slow
 def test_a_damaged_file_is_refused_by_its_name():
     done = fuzz('--only', 'outlines,empty,1')
     assert done.returncode == 0, done.stdout + done.stderr

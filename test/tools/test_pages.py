@@ -14,6 +14,7 @@ from tools.moving_picture import moving_picture
 from tools.symptoms import delay, scale_calibration
 
 
+@pytest.mark.slow
 def test_the_picture_shows_the_floor_that_was_found_and_a_map_that_grows(tmp_path) -> None:
     recording = write_kitti(tmp_path / 'drive', room_drive(14, step_m=0.12)[0])
     moving_picture(str(recording), tmp_path / 'drive.gif', width=400, count=40, seconds=2.0)

@@ -72,13 +72,8 @@ def stop_midway(process: subprocess.Popen[str], folder: Path, number: int) -> st
     return ' '.join(errors.split())
 
 
-@pytest.mark.parametrize(
-    'number',
-    [
-        signal.SIGINT,
-        *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGHUP)),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_keeps_what_is_mapped_and_no_whole_result_goes(drive, tmp_path, number):
     out, saved = tmp_path / 'out', tmp_path / 'room.map'
     process = run(drive, '--out', out, '--save-map', saved)

@@ -280,6 +280,7 @@ def test_the_path_alone_is_the_path_of_the_map(shared_data, tmp_path):
     assert path == (tmp_path / 'map' / 'camera_trajectory.txt').read_bytes()
 
 
+@pytest.mark.slow
 def test_a_saved_map_is_localized_in(recording, result, tmp_path):
     saved, first = tmp_path / 'room.map', tmp_path / 'first'
     done = segfloor('run', recording, '--out', first, '--save-map', saved, *KNOWN_MOUNT)

@@ -47,6 +47,7 @@ def test_an_impossible_name_is_one_line(drive, tmp_path, name):
         assert name[:40] in done.stderr
 
 
+@pytest.mark.slow
 def test_an_output_that_is_full_or_closed_is_no_traceback(drive):
     full = shell('segfloor info "$DRIVE" > /dev/full', DRIVE=drive)
     assert full.returncode == 1
@@ -57,6 +58,7 @@ def test_an_output_that_is_full_or_closed_is_no_traceback(drive):
     assert 'Traceback' not in shell('segfloor info "$DRIVE" | true', DRIVE=drive).stderr
 
 
+@pytest.mark.slow
 def test_a_closed_output_does_not_end_up_in_a_result(drive, tmp_path):
     """The next file that is opened takes the number of the closed one."""
     out = tmp_path / 'out'

@@ -169,6 +169,7 @@ def truth_of_room(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_map_is_measured_where_its_drive_starts(room, tmp_path):
     truth = truth_of_room(tmp_path / 'truth')
     outcome = do_job(job_of(room, tmp_path, truth=str(truth)))

@@ -101,20 +101,9 @@ def test_nothing_of_a_check_listens(room, tmp_path):
         check.communicate(timeout=60)
 
 
-SLOW = pytest.mark.slow
-
-
-@pytest.mark.parametrize(
-    ('jobs', 'number'),
-    [
-        pytest.param('2', signal.SIGINT, marks=SLOW),
-        ('1', signal.SIGTERM),
-        pytest.param('2', signal.SIGKILL, marks=SLOW),
-        pytest.param('1', signal.SIGINT, marks=SLOW),
-        pytest.param('2', signal.SIGTERM, marks=SLOW),
-        pytest.param('1', signal.SIGKILL, marks=SLOW),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize('jobs', ['1', '2'])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_killed_check_leaves_nothing(room, tmp_path, number, jobs):
     (temporary := tmp_path / 'temporary').mkdir()
     check = start_check(
