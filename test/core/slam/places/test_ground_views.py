@@ -147,6 +147,7 @@ def test_views_of_the_floor_are_saved(there):
     assert sum(len(k.ground.xy_m) for k in other.map.keyframes) > 1000
 
 
+@pytest.mark.slow
 def test_maps_of_earlier_releases_have_no_views_of_the_floor(there):
     slam, corners = equipped_slam(CAMERA, SETTINGS, MOUNT), ('keyframe_corners', 'corner_')
     arrays = {n: a for n, a in there[1].parts['slam'].items() if not n.startswith(corners)}

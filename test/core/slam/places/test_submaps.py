@@ -53,6 +53,7 @@ def test_what_was_mapped_while_lost_comes_at_once_when_the_map_is_recognised(mer
     assert slam.session.state is SessionState.MAPPING
 
 
+@pytest.mark.slow
 def test_keyframes_of_a_submap_are_published_in_the_map(merged):
     _, batches, poses = merged
     batch = max(batches, key=len)
