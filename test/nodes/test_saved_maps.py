@@ -142,7 +142,6 @@ def test_the_nodes_save_one_file_with_all_parts(saved) -> None:
     assert len(parts['slam']['point_stable_id']) > 100
 
 
-@pytest.mark.slow
 def test_a_saved_map_is_pruned_and_looked_at_on_the_robot(loaded, drive, tmp_path) -> None:
     chain = loaded()
     frames = drive[0][4:]
