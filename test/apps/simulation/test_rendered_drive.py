@@ -104,6 +104,7 @@ def test_what_the_camera_sees_standing_is_occupied_in_the_map(room):
         assert near[cells[:, 1], cells[:, 0]].mean() > 0.995
 
 
+@pytest.mark.slow
 def test_same_seed_same_images(room):
     first, again = room.frame(1), room.frame(1)
     np.testing.assert_array_equal(first.left, again.left)

@@ -146,6 +146,7 @@ def test_the_points_of_what_crosses_have_its_place_and_velocity():
     np.testing.assert_allclose(np.median(velocities, axis=0), [0.3, 0.45, 0.0], atol=0.12)
 
 
+@pytest.mark.slow
 def test_points_of_what_has_left_leave_the_map():
     def leaves(index):
         return (2.2, 0.0) if index < 14 else None

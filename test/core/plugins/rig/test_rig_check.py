@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice, pairwise
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,6 +24,11 @@ FRAME_S = 0.1
 def pose(time_frames: float) -> np.ndarray:
     """A drive along an arc: 5 cm and a degree a frame."""
     return planar_pose(0.05 * time_frames, 0.0, np.radians(1.0) * time_frames)
+
+
+def slowly(*values: float) -> list[Any]:
+    """Return values whose tests run at night."""
+    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
 
 
 @pytest.fixture(scope='module')
@@ -152,7 +158,7 @@ def test_an_eye_that_is_upside_down_sees_different_things(frames) -> None:
     assert 'turned' in found['different_views'].remedy
 
 
-@pytest.mark.parametrize('lag_frames', [1.0, 0.5, -1.0, 2.0])
+@pytest.mark.parametrize('lag_frames', [1.0, -1.0, *slowly(0.5, 2.0)])
 def test_a_lag_between_the_eyes_is_measured(frames, lag_frames) -> None:
     found = faults(late(frames, lag_frames))
     assert set(found) == {'not_simultaneous'}
@@ -218,7 +224,7 @@ def test_eyes_of_different_exposure_are_compared(frames, flickers) -> None:
     assert found['eyes_differ'].value == pytest.approx(1.5, abs=0.05)
 
 
-@pytest.mark.parametrize('factor', [1.1, 0.9, 2.0, 0.5])
+@pytest.mark.parametrize('factor', [1.1, 0.5, *slowly(0.9, 2.0)])
 def test_a_wrong_focal_length_shows_in_turns(turning, factor) -> None:
     assert faults(turning) == {}
     wrong = replace(CAMERA, fx=factor * CAMERA.fx, fy=factor * CAMERA.fy)
@@ -258,7 +264,7 @@ def test_a_wrong_focal_length_is_not_said_of_a_straight_drive() -> None:
 
 
 @pytest.mark.parametrize('offset_px', [5, -5, 2])
-@pytest.mark.parametrize('turn_deg', [0.0, 1.0])
+@pytest.mark.parametrize('turn_deg', [0.0, *slowly(1.0)])
 def test_a_principal_point_that_is_off_in_one_eye_shows_in_any_motion(turn_deg, offset_px) -> None:
     room = StereoRoom(seed=5)
     poses = [planar_pose(0.03 * i, 0.0, np.radians(turn_deg) * i) for i in range(SETTLED_FRAMES)]

@@ -68,7 +68,10 @@ def test_a_retired_keyframe_keeps_its_place_beside_the_one_it_follows():
     assert 1 not in order and 2 not in order
 
 
-@pytest.mark.parametrize(('seed', 'contrast', 'turn_rad'), [(0, 60.0, 0.0), (9, 35.0, 0.02)])
+@pytest.mark.parametrize(
+    ('seed', 'contrast', 'turn_rad'),
+    [pytest.param(0, 60.0, 0.0, marks=pytest.mark.slow), (9, 35.0, 0.02)],
+)
 def test_driving_to_and_fro_makes_its_views_once(seed, contrast, turn_rad):
     room = StereoRoom(seed, contrast)
     x = np.concatenate([np.arange(0, 10), np.arange(10, 0, -1)])

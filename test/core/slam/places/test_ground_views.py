@@ -78,6 +78,7 @@ def driven_back():
     return slam, results
 
 
+@pytest.mark.slow
 def test_a_corridor_that_is_driven_back_is_known(driven_back):
     slam, results = driven_back
     assert len(slam.map.loops) >= 3

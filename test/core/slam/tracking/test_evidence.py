@@ -137,7 +137,7 @@ def test_what_errs_by_more_than_any_image_does_is_something_else() -> None:
     assert found.log_ratio < ENOUGH_EVIDENCE
 
 
-@pytest.mark.parametrize('noise_px', [1.0, 2.0])
+@pytest.mark.parametrize('noise_px', [1.0, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_poses_are_as_unsure_as_their_mixture_says(noise_px: float) -> None:
     """A third of the matches is wrong, and the noise may be twice what it is announced to be."""
     rng, errors = np.random.default_rng(7), []
