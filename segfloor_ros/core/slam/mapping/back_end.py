@@ -6,7 +6,7 @@ Runs what takes long, an adjustment or the closing of a loop, beside tracking or
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -42,12 +42,18 @@ GROWN = 1.25
 it was last: that costs a long drive no more than a few adjustments of all it has mapped."""
 
 
+OBSERVATIONS = 150_000
+"""An adjustment of the whole map that does not run on a thread is done in parts: a keyframe goes
+through so many observations of it, about as many as the adjustment of its neighbourhood does."""
+
+
 class BackEnd:
     """Adjusts the neighbourhood of every keyframe, closes loops, and adjusts the whole map after a
     loop that moves it far or once it has grown.
 
-    background: on threads beside tracking; else at once, so that the outcome does not depend on
-    timing. Tracking never waits for an adjustment of the whole map.
+    background: on threads beside tracking; else at once, or over the next keyframes where it takes
+    long, so that the outcome does not depend on timing. Tracking never waits for an adjustment of
+    the whole map.
     """
 
     def __init__(self, sparse_map: SparseMap, front_end: FrontEnd, background: bool) -> None:
@@ -108,9 +114,11 @@ class BackEnd:
             if not closed:
                 self._adjust(keyframe)
             return False
-        closed = closed and self._collect(wait=True)
+        has_changed = self._collect(wait=True)
+        self._global.go_on(OBSERVATIONS)
+        has_changed |= self._collect(wait=True)
         self._adjust(keyframe)
-        return self._collect(wait=True) or closed
+        return self._collect(wait=True) or has_changed
 
     def reset(self) -> None:
         """Begin an empty map; no id is given twice."""
@@ -196,22 +204,21 @@ class BackEnd:
             self._adjusted_keyframes = len(copied.records)
             apply_global(self._map, result)
 
-        self._global.submit(
-            partial(solve_global, self._rig.camera, copied, self._global.is_wanted()), apply
-        )
+        self._global.submit_parts(solve_global(self._rig.camera, copied), apply)
 
 
 class AdjustmentRunner:
     """Holds at most one adjustment.
 
-    Without `background` it is solved when it is submitted, so that the outcome does not depend on
-    timing.
+    Without `background` it is solved when it is submitted, or part by part when `go_on` is called,
+    so that the outcome does not depend on timing.
     """
 
     def __init__(self, background: bool) -> None:
         self._worker = ThreadPoolExecutor(1, 'adjustment') if background else None
         self._apply: Callable[[Any], None] | None = None
         self._result: Future[Any] = Future()
+        self._parts: Iterator[int] = iter(())
         self._dropped = 0
 
     @property
@@ -224,15 +231,10 @@ class AdjustmentRunner:
         """Whether there is an adjustment that was not collected yet."""
         return self._apply is not None
 
-    def is_wanted(self) -> Callable[[], bool]:
-        """Return whether the next adjustment is still wanted, to be asked while it runs."""
-        number = self._dropped
-        return lambda: self._dropped == number
-
     def reset(self) -> None:
         """Drop an adjustment; one that is running is asked to end."""
         self._dropped += 1
-        self._apply = None
+        self._apply, self._parts = None, iter(())
 
     def submit(self, solve: Callable[[], Any], apply: Callable[[Any], None]) -> None:
         """Begin an adjustment; the one before must have been collected. solve: works on a copy and
@@ -244,6 +246,38 @@ class AdjustmentRunner:
         else:
             self._result = Future()
             self._result.set_result(solve())
+
+    def submit_parts(
+        self, parts: Iterator[GlobalResult], apply: Callable[[GlobalResult | None], None]
+    ) -> None:
+        """Begin an adjustment that is done in parts, each of which yields the result so far."""
+        self._apply = apply
+        if self._worker is not None:
+            self._result = self._worker.submit(self._last, parts, self._dropped)
+        else:
+            self._result, self._parts = Future(), self._counted(parts)
+
+    def _last(self, parts: Iterator[GlobalResult], number: int) -> GlobalResult | None:
+        """Return the last result, or that so far once it is no longer wanted."""
+        found = None
+        for found in parts:  # noqa: B007
+            if self._dropped != number:
+                break
+        return found
+
+    def _counted(self, parts: Iterator[GlobalResult]) -> Iterator[int]:
+        """Yield how many observations each part goes through; note the last result."""
+        found = None
+        for found in parts:
+            yield len(found.planned.point)
+        self._result.set_result(found)
+
+    def go_on(self, observations: int) -> None:
+        """Go through at least so many observations of an adjustment that is done in parts."""
+        for count in self._parts:
+            observations -= count
+            if observations <= 0:
+                return
 
     def collect(self, wait: bool) -> bool:
         """Apply a finished adjustment; with `wait` a running one is waited for. Returns whether

@@ -178,32 +178,40 @@ def test_the_whole_map_is_adjusted_again_once_it_has_grown_or_a_loop_moves_it_fa
 def test_an_adjustment_of_the_whole_map_goes_on_beside_loops_that_move_it_little(
     closed, monkeypatch, off_m, goes_on
 ):
-    begun, end, wanted = threading.Event(), threading.Event(), []
+    begun, end, parts = threading.Event(), threading.Event(), []
 
-    def solve(_camera, _copied, is_wanted):
-        wanted.append(is_wanted)
-        begun.set()
-        end.wait(30)
+    def solve(_camera, _copied):
+        for part in range(3):
+            begun.set()
+            end.wait(30)
+            parts.append(part)
+            yield None
 
     monkeypatch.setattr(back_end, 'solve_global', solve)
     mapping, close = closing_loops(closed, monkeypatch, background=True)
     try:
         close(0.03)
         assert begun.wait(30)
+        first = mapping._global._result
         close(off_m)
-        assert wanted[0]() is goes_on
+        end.set()
+        first.result(30)
+        assert (len(parts) == 3) is goes_on
     finally:
         end.set()
         mapping.close()
 
 
 def test_an_adjustment_goes_on_beside_a_loop_that_is_not_closed(closed, monkeypatch):
-    end, wanted = threading.Event(), []
-    monkeypatch.setattr(
-        back_end,
-        'solve_global',
-        lambda _camera, _copied, is_wanted: wanted.append(is_wanted) or (end.wait(30) and None),
-    )
+    end, parts = threading.Event(), []
+
+    def solve(_camera, _copied):
+        for part in range(3):
+            end.wait(30)
+            parts.append(part)
+            yield None
+
+    monkeypatch.setattr(back_end, 'solve_global', solve)
     mapping, close = closing_loops(closed, monkeypatch, background=True)
     try:
         close(0.03)
@@ -212,10 +220,30 @@ def test_an_adjustment_goes_on_beside_a_loop_that_is_not_closed(closed, monkeypa
         assert mapping._global.holds_one
         end.set()
         mapping._global.collect(wait=True)
-        assert [is_wanted() for is_wanted in wanted] == [True]
+        assert len(parts) == 3
     finally:
         end.set()
         mapping.close()
+
+
+def test_without_a_thread_an_adjustment_is_done_over_the_next_keyframes(closed, monkeypatch):
+    """Its outcome is the same as at once, for nothing else moves the map here."""
+    poses = {}
+    for amount in (10**9, 1):
+        monkeypatch.setattr(back_end, 'OBSERVATIONS', amount)
+        mapping, close = closing_loops(closed, monkeypatch, background=False)
+        before = np.stack([k.T_camera_world for k in mapping._map.keyframes])
+        monkeypatch.setattr(mapping, '_adjust', lambda _: None)
+        close(0.03, go_on=False)
+        monkeypatch.setattr(mapping.loops, 'detect', lambda *_: [])
+        keyframes = 0
+        while mapping.holds_one(of_all=True):
+            mapping.take_in(mapping._map.keyframes[-1], None, None)
+            keyframes += 1
+        assert (keyframes == 1) is (amount > 1)
+        poses[amount] = np.stack([k.T_camera_world for k in mapping._map.keyframes])
+        assert np.abs(poses[amount] - before).max() > 1e-4
+    np.testing.assert_array_equal(poses[1], poses[10**9])
 
 
 def closing_loops(closed, monkeypatch, background):
@@ -226,13 +254,16 @@ def closing_loops(closed, monkeypatch, background):
     mapping = back_end.BackEnd(sparse_map, front_end, background)
     last = sparse_map.keyframes[-1]
 
-    def close(off_m):
+    def close(off_m, go_on=True):
         sparse_map.loops.clear()
         pose = se3_exp(np.array([off_m, 0.0, 0.0, 0.0, 0.0, 0.0])) @ last.T_camera_world
         match = Match(last.index, 0, pose, none, none, none)
         monkeypatch.setattr(mapping.loops, 'detect', lambda *_: [match])
         assert mapping._close_loop(last, None)
         mapping.collect(wait=True)
+        if go_on:
+            mapping._global.go_on(10**9)
+            mapping.collect(wait=True)
 
     return mapping, close
 
