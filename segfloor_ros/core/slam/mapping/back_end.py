@@ -43,15 +43,15 @@ it was last: that costs a long drive no more than a few adjustments of all it ha
 
 
 OBSERVATIONS = 150_000
-"""An adjustment of the whole map that does not run on a thread is done in parts: a keyframe goes
-through so many observations of it, about as many as the adjustment of its neighbourhood does."""
+"""An adjustment of the whole map that does not run on a thread is done in parts: a frame goes
+through so many observations of it, about as many as the adjustment of a neighbourhood does."""
 
 
 class BackEnd:
     """Adjusts the neighbourhood of every keyframe, closes loops, and adjusts the whole map after a
     loop that moves it far or once it has grown.
 
-    background: on threads beside tracking; else at once, or over the next keyframes where it takes
+    background: on threads beside tracking; else at once, or over the next frames where it takes
     long, so that the outcome does not depend on timing. Tracking never waits for an adjustment of
     the whole map.
     """
@@ -114,11 +114,12 @@ class BackEnd:
             if not closed:
                 self._adjust(keyframe)
             return False
-        has_changed = self._collect(wait=True)
-        self._global.go_on(OBSERVATIONS)
-        has_changed |= self._collect(wait=True)
+        if closed:
+            closed = self._collect(wait=True)
+            self._global.go_on(OBSERVATIONS)
+            closed |= self._collect(wait=True)
         self._adjust(keyframe)
-        return self._collect(wait=True) or has_changed
+        return self._collect(wait=True) or closed
 
     def reset(self) -> None:
         """Begin an empty map; no id is given twice."""
@@ -141,6 +142,16 @@ class BackEnd:
         before = self._map.keyframes[-1].T_camera_world
         if change():
             self._front_end.follow_map(before, self._map.keyframes[-1].T_camera_world)
+
+    @property
+    def is_due(self) -> bool:
+        """Whether a frame is to go on with an adjustment of the whole map."""
+        return self._global.holds_one and not self._background
+
+    def go_on(self) -> None:
+        """Go on with an adjustment of the whole map; the last part brings it into the map."""
+        self._global.go_on(OBSERVATIONS)
+        self.collect(wait=False)
 
     def collect(self, wait: bool) -> None:
         """Bring what is solved into the map; with `wait` a running adjustment of a neighbourhood is

@@ -226,22 +226,20 @@ def test_an_adjustment_goes_on_beside_a_loop_that_is_not_closed(closed, monkeypa
         mapping.close()
 
 
-def test_without_a_thread_an_adjustment_is_done_over_the_next_keyframes(closed, monkeypatch):
+def test_without_a_thread_an_adjustment_is_done_over_the_next_frames(closed, monkeypatch):
     """Its outcome is the same as at once, for nothing else moves the map here."""
     poses = {}
     for amount in (10**9, 1):
         monkeypatch.setattr(back_end, 'OBSERVATIONS', amount)
         mapping, close = closing_loops(closed, monkeypatch, background=False)
-        before = np.stack([k.T_camera_world for k in mapping._map.keyframes])
-        monkeypatch.setattr(mapping, '_adjust', lambda _: None)
+        keyframes = mapping._map.keyframes
+        before, frames = np.stack([k.T_camera_world for k in keyframes]), 0
         close(0.03, go_on=False)
-        monkeypatch.setattr(mapping.loops, 'detect', lambda *_: [])
-        keyframes = 0
-        while mapping.holds_one(of_all=True):
-            mapping.take_in(mapping._map.keyframes[-1], None, None)
-            keyframes += 1
-        assert (keyframes == 1) is (amount > 1)
-        poses[amount] = np.stack([k.T_camera_world for k in mapping._map.keyframes])
+        while mapping.is_due:
+            mapping.go_on()
+            frames += 1
+        assert (frames == 1) is (amount > 1)
+        poses[amount] = np.stack([k.T_camera_world for k in keyframes])
         assert np.abs(poses[amount] - before).max() > 1e-4
     np.testing.assert_array_equal(poses[1], poses[10**9])
 
