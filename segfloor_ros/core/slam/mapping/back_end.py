@@ -51,9 +51,9 @@ class BackEnd:
     """Adjusts the neighbourhood of every keyframe, closes loops, and adjusts the whole map after a
     loop that moves it far or once it has grown.
 
-    background: on threads beside tracking; else at once, or over the next frames where it takes
-    long, so that the outcome does not depend on timing. Tracking never waits for an adjustment of
-    the whole map.
+    background: on threads beside tracking; else at once, and of the whole map over the next frames,
+    so that the outcome does not depend on timing. Tracking never waits for an adjustment of the
+    whole map.
     """
 
     def __init__(self, sparse_map: SparseMap, front_end: FrontEnd, background: bool) -> None:
@@ -114,10 +114,7 @@ class BackEnd:
             if not closed:
                 self._adjust(keyframe)
             return False
-        if closed:
-            closed = self._collect(wait=True)
-            self._global.go_on(OBSERVATIONS)
-            closed |= self._collect(wait=True)
+        closed = closed and self._collect(wait=True)
         self._adjust(keyframe)
         return self._collect(wait=True) or closed
 
@@ -149,9 +146,8 @@ class BackEnd:
         return self._global.holds_one and not self._background
 
     def go_on(self) -> None:
-        """Go on with an adjustment of the whole map; the last part brings it into the map."""
+        """Go on with an adjustment of the whole map; `collect` brings it into the map."""
         self._global.go_on(OBSERVATIONS)
-        self.collect(wait=False)
 
     def collect(self, wait: bool) -> None:
         """Bring what is solved into the map; with `wait` a running adjustment of a neighbourhood is
@@ -229,7 +225,8 @@ class AdjustmentRunner:
         self._worker = ThreadPoolExecutor(1, 'adjustment') if background else None
         self._apply: Callable[[Any], None] | None = None
         self._result: Future[Any] = Future()
-        self._parts: Iterator[int] = iter(())
+        self._parts: Iterator[GlobalResult] = iter(())
+        self._found: GlobalResult | None = None
         self._dropped = 0
 
     @property
@@ -245,7 +242,7 @@ class AdjustmentRunner:
     def reset(self) -> None:
         """Drop an adjustment; one that is running is asked to end."""
         self._dropped += 1
-        self._apply, self._parts = None, iter(())
+        self._apply = None
 
     def submit(self, solve: Callable[[], Any], apply: Callable[[Any], None]) -> None:
         """Begin an adjustment; the one before must have been collected. solve: works on a copy and
@@ -258,15 +255,11 @@ class AdjustmentRunner:
             self._result = Future()
             self._result.set_result(solve())
 
-    def submit_parts(
-        self, parts: Iterator[GlobalResult], apply: Callable[[GlobalResult | None], None]
-    ) -> None:
+    def submit_parts(self, parts: Iterator[GlobalResult], apply: Callable[[Any], None]) -> None:
         """Begin an adjustment that is done in parts, each of which yields the result so far."""
-        self._apply = apply
-        if self._worker is not None:
-            self._result = self._worker.submit(self._last, parts, self._dropped)
-        else:
-            self._result, self._parts = Future(), self._counted(parts)
+        self._apply, self._parts, self._found = apply, parts, None
+        worker = self._worker
+        self._result = worker.submit(self._last, parts, self._dropped) if worker else Future()
 
     def _last(self, parts: Iterator[GlobalResult], number: int) -> GlobalResult | None:
         """Return the last result, or that so far once it is no longer wanted."""
@@ -276,19 +269,14 @@ class AdjustmentRunner:
                 break
         return found
 
-    def _counted(self, parts: Iterator[GlobalResult]) -> Iterator[int]:
-        """Yield how many observations each part goes through; note the last result."""
-        found = None
-        for found in parts:
-            yield len(found.planned.point)
-        self._result.set_result(found)
-
     def go_on(self, observations: int) -> None:
         """Go through at least so many observations of an adjustment that is done in parts."""
-        for count in self._parts:
-            observations -= count
+        for found in self._parts:
+            self._found = found
+            observations -= len(found.planned.point)
             if observations <= 0:
                 return
+        self._result.set_result(self._found)
 
     def collect(self, wait: bool) -> bool:
         """Apply a finished adjustment; with `wait` a running one is waited for. Returns whether

@@ -237,6 +237,7 @@ def test_without_a_thread_an_adjustment_is_done_over_the_next_frames(closed, mon
         close(0.03, go_on=False)
         while mapping.is_due:
             mapping.go_on()
+            mapping.collect(wait=False)
             frames += 1
         assert (frames == 1) is (amount > 1)
         poses[amount] = np.stack([k.T_camera_world for k in keyframes])
@@ -259,7 +260,7 @@ def closing_loops(closed, monkeypatch, background):
         monkeypatch.setattr(mapping.loops, 'detect', lambda *_: [match])
         assert mapping._close_loop(last, None)
         mapping.collect(wait=True)
-        if go_on:
+        if go_on and mapping.is_due:
             mapping._global.go_on(10**9)
             mapping.collect(wait=True)
 
