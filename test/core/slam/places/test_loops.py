@@ -21,6 +21,7 @@ from segfloor_ros.core.slam.places.loops import PlaceMatcher, is_no_drift
 from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import LoopEdge, Match, SparseMap
+from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 from segfloor_ros.core.twists import se3_exp
 
@@ -82,6 +83,29 @@ def test_a_loop_that_contradicts_the_map_is_not_noted_as_closed(monkeypatch):
     assert 'contradicts the map' in verdicts
     assert 'closed' not in verdicts
     assert slam.back_end.loop_count == 0
+
+
+def test_each_frame_does_one_part_of_an_adjustment_of_the_whole_map(monkeypatch):
+    parts, of_frames, solve, process = [], [], back_end.solve_global, StereoSlam.process
+
+    def noted(*arguments):
+        for found in solve(*arguments):
+            parts.append(found)
+            yield found
+
+    def counted(slam, frame):
+        before = len(parts)
+        results = process(slam, frame)
+        of_frames.append(len(parts) - before)
+        return results
+
+    monkeypatch.setattr(back_end, 'OBSERVATIONS', 1)
+    monkeypatch.setattr(back_end, 'solve_global', noted)
+    monkeypatch.setattr(StereoSlam, 'process', counted)
+    slam, errors = drive(np.array([0.25, 0.0, 0.1, 0.0, 0.03, 0.0]))
+    assert max(of_frames) == 1 and sum(of_frames) >= 5
+    assert not slam.back_end.is_due
+    assert errors[-1] < 0.03
 
 
 def test_both_ends_become_one_map(closed):
