@@ -184,7 +184,9 @@ def seen_from(slam, T_camera_world, image, uv_px):
     return Track(estimate, ids, measured, ids)
 
 
-@pytest.mark.parametrize(('shows', 'slides_m'), [('an edge', 0.1), ('a texture', 0.2)])
+@pytest.mark.parametrize(
+    ('shows', 'slides_m'), [('an edge', 0.03), ('an edge', 0.1), ('a texture', 0.2)]
+)
 def test_points_that_slide_along_an_edge_do_not_outweigh_wheels(
     frames, monkeypatch, shows, slides_m
 ):

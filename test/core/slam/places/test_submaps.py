@@ -8,6 +8,7 @@ from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.session import SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
+from segfloor_ros.core.slam.thresholds import PROOF
 
 SETTINGS = StereoSlamSettings(num_features=600)
 ROOM = StereoRoom()
@@ -73,7 +74,7 @@ def test_keyframes_of_a_submap_are_published_in_the_map(merged):
 
 def test_the_edges_between_merged_maps_are_where_their_keyframes_stand(merged):
     slam, _, _ = merged
-    assert len(slam.map.loops) >= 2
+    assert len(slam.map.loops) >= PROOF
     for loop in slam.map.loops:
         T_i, T_j = (slam.map.keyframes[k].T_camera_world for k in (loop.i, loop.j))
         np.testing.assert_allclose(loop.T_i_j, T_i @ invert(T_j), atol=0.05)

@@ -80,11 +80,11 @@ def test_points_on_an_edge_determine_nothing_along_it(contrast, slope):
     on_edge = np.stack([MIDDLE[0] + slope * (rows - MIDDLE[1]), rows], axis=1)
     covariance = fused(image, on_edge).covariance[:3, :3]
     along = np.array([slope, 1.0, 0.0]) / np.hypot(slope, 1.0)
-    assert np.sqrt(along @ covariance @ along) > 0.03
+    assert np.sqrt(along @ covariance @ along) > 0.045
 
 
 def test_a_plain_face_determines_nothing():
-    assert sigmas_m(noisy(np.full(U.shape, 90.0)), anywhere(200)).min() > 0.05
+    assert sigmas_m(noisy(np.full(U.shape, 90.0)), anywhere(200)).min() > 0.06
 
 
 def test_corners_and_weak_textures_determine_the_place_to_millimetres():
