@@ -298,16 +298,18 @@ def _seen(frame: FrameEvidence, mask: NDArray[np.uint8]) -> Seen:
     """Return what the likelihood weighs. mask: (R, W), with what is floor so far."""
     pair, heights, compared, half = frame.pair, frame.heights, frame.compared, frame.view.half
     grey = cv2.blur(pair.left_rows, (BLOCK_PX, BLOCK_PX))[::STEP_PX, ::STEP_PX]
+    columns = np.arange(0, frame.view.camera.width, STEP_PX)
     return Seen(
         floor_px=compared.floor_px,
         disparity_px=frame.disparity_px[half],
         slope=frame.view.line.slope,
         texture=pair.texture[half] / pair.enough,
         lower=(heights.off & ~heights.above)[half],
+        left_only=columns < compared.floor_px,
         grey=grey.astype(np.float32),
         better=compared.better,
         noise_grey=pair.noise_grey if pair.measured is None else 0.0,
-        is_floor=mask[half] == FLOOR,
+        mask=mask[half],
     )
 
 

@@ -18,7 +18,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.floor.disparity.matching import NOISE_PX, NOISE_SLOPE, SAME_PX, SIGMAS
+from segfloor_ros.core.contracts import FLOOR, NOT_FLOOR
+from segfloor_ros.core.floor.disparity.matching import (
+    BLOCK_PX,
+    COARSE_BLOCK_PX,
+    NOISE_PX,
+    NOISE_SLOPE,
+    SAME_PX,
+    SIGMAS,
+)
 from segfloor_ros.core.floor.disparity.profile import STEP_PX
 from segfloor_ros.core.floor.mask.look import sigmas_off_floor
 from segfloor_ros.core.floor.mask.painting import (
@@ -34,13 +42,13 @@ from segfloor_ros.core.geometry import Array
 Picture = NDArray[np.float32]
 
 WEIGHTS = {
-    'one': 0.68,
-    'above': -0.41,
-    'rises': 0.88,
-    'steep': -1.83,
-    'on': 2.05,
-    'matched': -1.48,
-    'look': 0.93,
+    'one': 1.17,
+    'above': -0.33,
+    'rises': 1.16,
+    'steep': -1.09,
+    'on': 1.61,
+    'matched': -1.17,
+    'look': 0.94,
 }
 """By feature, made by `tools/fit_floor.py`.
 
@@ -51,20 +59,25 @@ off. matched: log ratio of the difference of both images on the floor to that at
 disparity. look: log ratio of how likely its brightness is of the floor to how often it is seen.
 """
 
-_SURE, _UNLIKELY = (math.log(p / (1 - p)) for p in (0.95, 1 / 3))
-"""Log odds: what is more likely floor than the first is floor, what is less likely than the second
-is none."""
+_SURE, _HARDLY, _UNLIKELY = (math.log(p / (1 - p)) for p in (0.95, 0.73, 1 / 3))
+"""Log odds: what is more likely floor than the first is floor, what is less likely than the last is
+none, and of what only one camera sees what is less likely than the second."""
+_CARRY_PX = 20.0
+"""So far a likelihood is carried where no edge is, in pixels of these pictures."""
 
-_LOCAL, _ROUNDS = (31, 15), 3
+_LOCAL, _ROUNDS = (31, 15), 4
 """Columns and rows of the window in which the floor around a pixel is measured, and how often."""
 _NOTHING = 0.02
 """So small a share of a window tells nothing."""
-_NEAR, _WIDE = (5, 5), (9, 9)
-"""Columns and rows of the windows over which pixels are averaged, and are counted."""
-_MOST_SIGMAS, _MOST_NATS = 12.0, 6.0
+_BLOCK, _NEAR, _WIDE = (COARSE_BLOCK_PX, COARSE_BLOCK_PX), (5, 5), (9, 9)
+"""Columns and rows of the block that is matched, and of the windows over which pixels are averaged,
+and are counted."""
+_MOST_PX, _MOST_SIGMAS, _MOST_NATS = 30.0, 12.0, 6.0
 """No feature says more: what is wrong is then as wrong as it can be."""
-_UNEVEN = 0.7, 2.8
-"""How uneven floors are, in sigmas of a disparity, at least and at most."""
+_WELL_KNOWN = 0.3
+"""What is known as well as this on average says all that it can."""
+_UNEVEN_PX = 0.05, 1.4
+"""How uneven the disparities of floors are, at least and at most."""
 _RISE_SIGMA_PX = 0.7, 2.0
 """Error of the difference of two disparities, at least and at most."""
 _BINS, _END = 2, 10
@@ -79,9 +92,11 @@ class Seen:
 
     floor_px, disparity_px: disparity of the floor, and the matched one, 0 where none is. slope: of
     a floor's disparity, per row of the image. texture: as many times of what is surely no noise.
-    lower: bool, what lies deeper than a robot may drop. grey: brightness, smoothed. better: log
+    lower: bool, what lies deeper than a robot may drop. left_only: bool, what the right camera does
+    not see if it is floor. grey: brightness, smoothed. better: log
     ratio of how much the images differ on the floor to how much they do as matched. noise_grey: of
-    the images, 0 of depth that is measured. is_floor: bool, what is floor so far.
+    the images, 0 of depth that is measured. mask: uint8, what
+    is floor so far, and what is not.
     """
 
     floor_px: Picture
@@ -89,10 +104,16 @@ class Seen:
     slope: float
     texture: Picture
     lower: NDArray[np.bool_]
+    left_only: NDArray[np.bool_]
     grey: Picture
     better: Picture
     noise_grey: float
-    is_floor: NDArray[np.bool_]
+    mask: NDArray[np.uint8]
+
+    @property
+    def is_floor(self) -> NDArray[np.bool_]:
+        """What is floor so far."""
+        return self.mask == FLOOR
 
 
 def known_weight(seen: Seen) -> Picture:
@@ -114,11 +135,11 @@ def features(seen: Seen, weight: Picture) -> Picture:
     """
     known = (seen.disparity_px > 0).astype(np.float32)
     one = np.ones_like(known)
-    height, mostly_on = _local_height(seen, weight, known)
+    height, mostly_on = _height(seen, weight)
     rises = _rise(seen, weight, known)
     # What is as level as a floor is none where it is higher, and what stands on it is higher.
-    is_higher = 1 - np.exp(-(np.maximum(height, 0) ** 2) / 2)
-    rises *= np.where(rises > 0, np.exp(-(height**2) / 8), is_higher)
+    is_level = np.exp(-(height**2) / 2)
+    rises *= np.where(rises > 0, is_level, (1 - is_level) * (height > 0))
     positive = (np.maximum(values, 0) for values in (height, rises, -rises, mostly_on))
     look = _look(seen.grey, seen.is_floor)
     return np.stack([one, *positive, seen.better * known, look])
@@ -133,27 +154,31 @@ def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, floa
     return np.float32(np.clip(spread, *bounds))
 
 
-def _local_height(seen: Seen, weight: Picture, known: Picture) -> tuple[Picture, Picture]:
-    """Return how high pixels are above the floor around them, in sigmas, and which share around
-    each is on it, less that which is off it.
+def _height(seen: Seen, weight: Picture) -> tuple[Picture, Picture]:
+    """Return how high blocks of pixels are above the floor around them, in sigmas, and which share
+    around each is on it, less that which is off it.
 
-    The profile may lie above the ground beside a stone: at first what is lower counts as floor, but
-    nothing that is higher.
+    The error is that of this very floor: how blocks differ from the floor around them. The profile
+    may lie above the ground beside a stone: at first what is lower counts as floor, but nothing
+    that is higher.
     """
-    above = np.clip((seen.disparity_px - seen.floor_px) / np.float32(NOISE_PX), -60, 60) * known
-    floor, lowest = np.zeros_like(above), -60.0
+    known = (seen.disparity_px > 0).astype(np.float32)
+    above = np.clip(seen.disparity_px - seen.floor_px, -_MOST_PX, _MOST_PX) * known
+    share = cv2.blur(weight, _BLOCK)
+    mean = cv2.blur(weight * above, _BLOCK) / np.maximum(share, np.float32(_NOTHING))
+    floor, sigma, lowest = np.zeros_like(above), np.float32(NOISE_PX), -_MOST_PX
     for _ in range(_ROUNDS):
-        gap = above - floor
-        on = weight * ((gap < SIGMAS * 1.5) & (gap > lowest))
-        floor = cv2.blur(on * above, _LOCAL) / (cv2.blur(on, _LOCAL) + np.float32(_NOTHING))
-        lowest = -SIGMAS * 1.5
-    smooth = mean_of_known(above, known, _NEAR)[0] - floor
-    even = (weight > LEAST_KNOWN) & (np.abs(smooth) < 3 * SIGMAS)
-    height = (above - floor) / _spread(smooth, even, _UNEVEN)
-    bounded = np.clip(height, -_MOST_SIGMAS, _MOST_SIGMAS) * weight
+        gap = mean - floor
+        on = share * ((gap < SIGMAS * sigma) & (gap > lowest))
+        floor = cv2.blur(on * mean, _LOCAL) / (cv2.blur(on, _LOCAL) + np.float32(_NOTHING))
+        gap = mean - floor
+        even = (share > LEAST_KNOWN) & (np.abs(gap) < SIGMAS * SAME_PX)
+        sigma = _spread(gap, even, _UNEVEN_PX)
+        lowest = -SIGMAS * sigma
+    height = np.clip(gap / sigma, -_MOST_SIGMAS, _MOST_SIGMAS)
     on_off = np.where(np.abs(height) < SIGMAS, weight, -weight)
-    near, wide = mean_of_known(bounded, known, _NEAR)[0], mean_of_known(on_off, known, _WIDE)[0]
-    return near * known, wide
+    mostly_on = mean_of_known(on_off, known, _WIDE)[0]
+    return height * np.minimum(share / np.float32(_WELL_KNOWN), 1), mostly_on
 
 
 def _rise(seen: Seen, weight: Picture, known: Picture) -> Picture:
@@ -200,12 +225,86 @@ class Likelihood:
 
     def weighed(self, mask: NDArray[np.uint8], seen: Seen) -> NDArray[np.uint8]:
         """Return a mask (R, W) without floor that is not likely, and with what surely is floor,
-        where that is measured. What lies too low for a robot is a drop, or what a floor mirrors,
-        and no floor however it looks.
+        where that is measured, or carried to what only the left camera sees. What lies too low for
+        a robot is a drop, or what a floor mirrors, and no floor however it looks.
         """
         known = known_weight(seen)
-        log_ratio = np.tensordot(self.weights, features(seen, known), 1)
-        judged = (known > LEAST_KNOWN) & (seen.floor_px > LEAST_FLOOR_PX)
-        unlikely = judged & (log_ratio < _UNLIKELY)
+        every = features(seen, known)
+        log_ratio = np.tensordot(self.weights, every, 1)
+        near_enough = seen.floor_px > LEAST_FLOOR_PX
+        judged = (known > LEAST_KNOWN) & near_enough
+        unlikely = with_rims(judged & (log_ratio < _UNLIKELY), judged & (log_ratio > 0), seen)
         sure = judged & ~seen.lower & (log_ratio > _SURE)
+        one_sided = seen.left_only & near_enough & ~judged
+        if one_sided.any():
+            look = every[list(WEIGHTS).index('look')]
+            carried = carry(np.where(judged, log_ratio, 0), known * judged, seen) + look / 2
+            unlikely |= one_sided & (carried < _HARDLY)
+            sure |= one_sided & (carried > _SURE)
+        sure &= ~unlikely
         return with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))
+
+
+def with_rims(
+    unlikely: NDArray[np.bool_], likely: NDArray[np.bool_], seen: Seen
+) -> NDArray[np.bool_]:
+    """Return what is unlikely floor (h, w), and around it what looks like that rather than like
+    the floor beside it: so near to a border what is matched may be of either side.
+    """
+    grey, reach = seen.grey, np.ones((2 * COARSE_BLOCK_PX - 1,) * 2, np.uint8)
+    (of_thing, _), (of_floor, variance) = (_around(grey, part) for part in (unlikely, likely))
+    noise = (2 * seen.noise_grey / BLOCK_PX) ** 2
+    like_thing = (grey - of_thing) ** 2 < (grey - of_floor) ** 2 + variance / 4 + noise
+    alone = cv2.blur(likely.astype(np.float32), _WIDE) < _NOTHING
+    near = cv2.dilate(unlikely.view(np.uint8), reach) > 0
+    rims: NDArray[np.bool_] = unlikely | (near & (like_thing | alone))
+    return rims
+
+
+def _around(grey: Picture, where: NDArray[np.bool_]) -> tuple[Picture, Picture]:
+    """Return mean and variance of grey levels around each pixel, of those pixels that are set."""
+    part = where.astype(np.float32)
+    share = np.maximum(cv2.blur(part, _WIDE), np.float32(1e-3))
+    mean, square = (cv2.blur(part * grey**power, _WIDE) / share for power in (1, 2))
+    return mean, np.maximum(square - mean**2, 0)
+
+
+def carry(log_ratio: Picture, weight: Picture, seen: Seen) -> Picture:
+    """Return the log ratio of what is known around each pixel (h, w), which edges of the image keep
+    from spreading; toward 0 where nothing is near. weight: of what is known.
+
+    The normalised convolution of Gastal and Oliveira, Domain Transform for Edge-Aware Image and
+    Video Processing (2011), of a quarter of the resolution, along rows and then along columns.
+    What stands is no floor, however little of it is measured.
+    """
+    stands = seen.mask == NOT_FLOOR
+    weight = np.where(stands, np.float32(1), np.minimum(weight / np.float32(0.5), 1))
+    values = np.where(stands, np.float32(-_MOST_NATS), np.clip(log_ratio, -_MOST_NATS, _MOST_NATS))
+    # Farther from these columns nothing gets there.
+    reach = int(np.flatnonzero(seen.left_only.any(axis=0))[-1]) + 2 * round(_CARRY_PX)
+    parts = np.stack([values * weight, weight])[:, :, :reach]
+    size = parts.shape[:0:-1]
+    parts = np.stack([cv2.blur(part, (3, 3))[::2, ::2] for part in parts])
+    level = np.log(cv2.GaussianBlur(seen.grey[:, :reach], (3, 3), 0)[::2, ::2] + 8)
+    steps = [np.abs(np.diff(level, axis=i, prepend=np.take(level, [0], axis=i))) for i in (1, 0)]
+    floor = parts[1] > LEAST_KNOWN
+    own = np.median(np.concatenate([step[floor] for step in steps])) if floor.any() else 1.0
+    for step, axis in zip(steps, (1, 0), strict=True):
+        kept = np.exp(-(2 / _CARRY_PX + np.maximum(step / (2 * max(own, 1e-3)) - 1, 0)))
+        parts = _spread_along(parts, kept.astype(np.float32), axis)
+    carried = cv2.resize(parts[0] / (parts[1] + np.float32(_NOTHING)), size)
+    whole = np.zeros_like(log_ratio)
+    whole[:, :reach] = carried
+    return whole
+
+
+def _spread_along(parts: Picture, kept: Picture, axis: int) -> Picture:
+    """Return pictures (n, h, w) with what comes from both sides along an axis; kept: (h, w), which
+    share of that is left from the pixel before on.
+    """
+    lines, share = np.moveaxis(parts, axis + 1, 0), np.moveaxis(kept, axis, 0)
+    forth, back = lines.copy(), lines.copy()
+    for i in range(1, len(lines)):
+        forth[i] += share[i] * forth[i - 1]
+        back[-1 - i] += share[-i] * back[-i]
+    return np.moveaxis(forth + back - lines, 0, axis + 1)
