@@ -36,7 +36,6 @@ from segfloor_ros.core.floor.disparity.profile import (
 )
 from segfloor_ros.core.floor.mask.filling import (
     NetworkFloor,
-    beside_something,
     blank_feet,
     drop_islands,
     fill_gaps,
@@ -46,13 +45,7 @@ from segfloor_ros.core.floor.mask.filling import (
 from segfloor_ros.core.floor.mask.likelihood import Likelihood, Seen
 from segfloor_ros.core.floor.mask.look import unlike_floor
 from segfloor_ros.core.floor.mask.painting import with_floor, without_floor
-from segfloor_ros.core.floor.mask.pixel_evidence import (
-    FrameEvidence,
-    Heights,
-    below_floor,
-    compare,
-    judge,
-)
+from segfloor_ros.core.floor.mask.pixel_evidence import FrameEvidence, Heights, compare, judge
 from segfloor_ros.core.floor.pair import Pair
 from segfloor_ros.core.floor.plane.plane import PROVED, Fixture, expectations, plane_of_frame
 from segfloor_ros.core.floor.scan import FloorScanner, OverheadMatcher
@@ -226,10 +219,9 @@ class FloorSegmentation:
         """
         view, pair, consistent = frame.view, frame.pair, frame.compared.consistent
         mask, odd, off = judged, looks_odd, frame.heights.mean_off
-        beside = beside_something(view, mask)
         for _ in range(2):
-            mask = fill_regions(frame, mask, beside, odd)
-            mask = fill_gaps(view, frame.profile, mask, consistent & ~(beside | odd))
+            mask = fill_regions(frame, mask, odd)
+            mask = fill_gaps(view, frame.profile, mask, consistent & ~odd)
             unlike = unlike_floor(pair.left[pair.part], mask == FLOOR)
             odd = unlike & (off | looks_odd)
             mask = without_floor(mask, unlike & off & pair.textured)
@@ -278,16 +270,12 @@ class FloorSegmentation:
 
 def _judged(frame: FrameEvidence, step_m: float) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Return a mask (R, W) of what the pixels of a frame say by themselves, cut back to edges, and
-    left open where they do not look like floor and are not measured to lie on it; and of what a
-    network says stands there; and what does not look like floor (R, W). step_m: what a robot
-    climbs.
+    of what a network says stands there; and what does not look like floor (R, W). step_m: what a
+    robot climbs.
     """
     pair = frame.pair
     mask = trim_to_edges(judge(frame, step_m), pair.slope)
     odd = unlike_floor(pair.left[pair.part], mask == FLOOR)
-    doubtful = (mask == FLOOR) & odd
-    mask = without_floor(mask, doubtful)
-    mask = with_floor(mask, doubtful & ~frame.heights.mean_off & below_floor(mask))
     mask = pair.without_hidden(mask)
     if pair.said_there is not None:
         mask[pair.said_there == NOT_FLOOR] = NOT_FLOOR

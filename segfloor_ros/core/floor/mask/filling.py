@@ -56,16 +56,16 @@ measured."""
 
 
 def fill_regions(
-    frame: FrameEvidence, mask: NDArray[np.uint8], beside: NDArray[np.bool_], odd: NDArray[np.bool_]
+    frame: FrameEvidence, mask: NDArray[np.uint8], odd: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
     """Return the mask with NO_EVIDENCE turned to floor in regions that look alike and continue
     floor.
 
-    beside, odd: (R, W), where no region goes on: `beside_something`, and what does not look like
-    floor. A region is bounded by edges of the image stronger than most of the floor's own; floor by
-    evidence must be in a share of its columns. In it a pixel becomes floor below floor, the next
-    evidence up its column; or between floor on its left and right; or, if it is not blank and not
-    measured above the floor, nearer than any of its floor.
+    odd: (R, W), what does not look like floor: there no region goes on. A region is bounded by
+    edges of the image stronger than most of the floor's own; floor by evidence must be in a share
+    of its columns. In it a pixel becomes floor below floor, the next evidence up its column; or
+    between floor on its left and right; or, if it is not blank and not measured above the floor,
+    nearer than any of its floor.
     """
     half, slope = frame.view.half, frame.pair.picture_slope
     small = mask[half]
@@ -87,7 +87,7 @@ def fill_regions(
     nearer = (rows >= highest) & (not_blank > 0) & ~frame.heights.standing[half]
     left, right = last_evidence(small, 1)[1], last_evidence(small[:, ::-1], 1)[1][:, ::-1]
     next_to_floor = left & right | below_floor(small)
-    fill = inside & (nearer | next_to_floor) & ~(beside | odd)[half]
+    fill = inside & (nearer | next_to_floor) & ~odd[half]
     mask = with_floor(mask, enlarged(fill, mask))
     # Light on the floor is no border, where both ends of a stretch are known.
     no_border = agreed & (slope < _STRONG_SLOPE)
@@ -112,20 +112,6 @@ def _top_of_supported(
     is_large = np.bincount(owner, minlength=count) >= _MIN_REGION_PX
     is_large[0] = False
     return np.where(is_large & is_wide, first, len(region))
-
-
-def beside_something(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Tell of what only the left camera sees, at the left border of a mask (R, W), where it does
-    not lie beside floor that both cameras see: what stands there is taken to go on.
-    """
-    floor_px = np.float32(view.line.slope) * (view.derolled - np.float32(view.line.horizon))
-    first = (mask != NO_EVIDENCE).argmax(axis=1)[:, None]
-    begins_with_floor = np.take_along_axis(mask, first, axis=1) == FLOOR
-    begins_with_floor &= first * view.step <= floor_px[:, :1] + _UNMATCHED_PX
-    # Rows in between begin with a hole, as high as the window in which texture is measured.
-    hole = np.ones((TEXTURE_WINDOW_PX + 2, 1), np.uint8)
-    near = cv2.dilate(begins_with_floor.view(np.uint8), hole)
-    return (view.columns < floor_px) & (near == 0)
 
 
 def fill_gaps(

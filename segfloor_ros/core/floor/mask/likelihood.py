@@ -42,13 +42,13 @@ from segfloor_ros.core.geometry import Array
 Picture = NDArray[np.float32]
 
 WEIGHTS = {
-    'one': 1.17,
-    'above': -0.33,
-    'rises': 1.16,
-    'steep': -1.09,
+    'one': 1.27,
+    'above': -0.34,
+    'rises': 1.27,
+    'steep': -1.17,
     'on': 1.61,
-    'matched': -1.17,
-    'look': 0.94,
+    'matched': -1.14,
+    'look': 0.95,
 }
 """By feature, made by `tools/fit_floor.py`.
 
@@ -58,6 +58,8 @@ that of what is upright. on: share of what is around it that is on that floor, l
 off. matched: log ratio of the difference of both images on the floor to that at the matched
 disparity. look: log ratio of how likely its brightness is of the floor to how often it is seen.
 """
+
+_HEIGHT, _LOOK = (list(WEIGHTS).index(name) for name in ('above', 'look'))
 
 _SURE, _HARDLY, _UNLIKELY = (math.log(p / (1 - p)) for p in (0.95, 0.73, 1 / 3))
 """Log odds: what is more likely floor than the first is floor, what is less likely than the last is
@@ -166,16 +168,16 @@ def _height(seen: Seen, weight: Picture) -> tuple[Picture, Picture]:
     above = np.clip(seen.disparity_px - seen.floor_px, -_MOST_PX, _MOST_PX) * known
     share = cv2.blur(weight, _BLOCK)
     mean = cv2.blur(weight * above, _BLOCK) / np.maximum(share, np.float32(_NOTHING))
-    floor, sigma, lowest = np.zeros_like(above), np.float32(NOISE_PX), -_MOST_PX
+    floor, sigma, lowest = np.zeros_like(above), NOISE_PX, -_MOST_PX
     for _ in range(_ROUNDS):
         gap = mean - floor
         on = share * ((gap < SIGMAS * sigma) & (gap > lowest))
         floor = cv2.blur(on * mean, _LOCAL) / (cv2.blur(on, _LOCAL) + np.float32(_NOTHING))
         gap = mean - floor
         even = (share > LEAST_KNOWN) & (np.abs(gap) < SIGMAS * SAME_PX)
-        sigma = _spread(gap, even, _UNEVEN_PX)
+        sigma = float(_spread(gap, even, _UNEVEN_PX))
         lowest = -SIGMAS * sigma
-    height = np.clip(gap / sigma, -_MOST_SIGMAS, _MOST_SIGMAS)
+    height = np.clip(gap / np.float32(sigma), -_MOST_SIGMAS, _MOST_SIGMAS)
     on_off = np.where(np.abs(height) < SIGMAS, weight, -weight)
     mostly_on = mean_of_known(on_off, known, _WIDE)[0]
     return height * np.minimum(share / np.float32(_WELL_KNOWN), 1), mostly_on
@@ -233,32 +235,33 @@ class Likelihood:
         log_ratio = np.tensordot(self.weights, every, 1)
         near_enough = seen.floor_px > LEAST_FLOOR_PX
         judged = (known > LEAST_KNOWN) & near_enough
-        unlikely = with_rims(judged & (log_ratio < _UNLIKELY), judged & (log_ratio > 0), seen)
+        unlikely = judged & (log_ratio < _UNLIKELY)
+        is_higher = unlikely & (every[_HEIGHT] > SIGMAS)
+        unlikely |= rims(is_higher, judged & (log_ratio > 0), seen)
         sure = judged & ~seen.lower & (log_ratio > _SURE)
         one_sided = seen.left_only & near_enough & ~judged
         if one_sided.any():
-            look = every[list(WEIGHTS).index('look')]
-            carried = carry(np.where(judged, log_ratio, 0), known * judged, seen) + look / 2
+            carried = carry(np.where(judged, log_ratio, 0), known * judged, seen)
+            carried += every[_LOOK] / 2
             unlikely |= one_sided & (carried < _HARDLY)
             sure |= one_sided & (carried > _SURE)
         sure &= ~unlikely
         return with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))
 
 
-def with_rims(
-    unlikely: NDArray[np.bool_], likely: NDArray[np.bool_], seen: Seen
-) -> NDArray[np.bool_]:
-    """Return what is unlikely floor (h, w), and around it what looks like that rather than like
-    the floor beside it: so near to a border what is matched may be of either side.
+def rims(higher: NDArray[np.bool_], likely: NDArray[np.bool_], seen: Seen) -> NDArray[np.bool_]:
+    """Return what lies around things (h, w) and looks like them rather than like the likely floor
+    next to it: the foot of a thing is no higher than a floor, and at its border the block that is
+    matched holds both.
     """
     grey, reach = seen.grey, np.ones((2 * COARSE_BLOCK_PX - 1,) * 2, np.uint8)
-    (of_thing, _), (of_floor, variance) = (_around(grey, part) for part in (unlikely, likely))
+    (of_thing, _), (of_floor, variance) = (_around(grey, part) for part in (higher, likely))
     noise = (2 * seen.noise_grey / BLOCK_PX) ** 2
     like_thing = (grey - of_thing) ** 2 < (grey - of_floor) ** 2 + variance / 4 + noise
     alone = cv2.blur(likely.astype(np.float32), _WIDE) < _NOTHING
-    near = cv2.dilate(unlikely.view(np.uint8), reach) > 0
-    rims: NDArray[np.bool_] = unlikely | (near & (like_thing | alone))
-    return rims
+    near = cv2.dilate(higher.view(np.uint8), reach) > 0
+    found: NDArray[np.bool_] = near & (like_thing | alone)
+    return found
 
 
 def _around(grey: Picture, where: NDArray[np.bool_]) -> tuple[Picture, Picture]:

@@ -37,12 +37,7 @@ from segfloor_ros.core.floor.disparity.profile import (
     pixels_where,
     surface_above,
 )
-from segfloor_ros.core.floor.mask.painting import (
-    LEAST_KNOWN,
-    enlarged,
-    mean_of_known,
-    without_floor,
-)
+from segfloor_ros.core.floor.mask.painting import LEAST_KNOWN, enlarged, mean_of_known
 from segfloor_ros.core.floor.pair import Pair
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
@@ -206,8 +201,7 @@ def judge(frame: FrameEvidence, step_m: float) -> NDArray[np.uint8]:
     above, off, textured = heights.above, heights.off, frame.pair.textured
     # What seems to lie below the floor may be what the floor mirrors.
     sure = (textured & compared.against) | (compared.denied & above)
-    measured = textured & (frame.disparity_px >= np.float32(LEAST_FLOOR_PX))
-    may_be = measured & ~off
+    may_be = textured & ~off & (frame.disparity_px >= np.float32(LEAST_FLOOR_PX))
     mask = np.full(off.shape, NO_EVIDENCE, np.uint8)
     mask[may_be & ~(compared.against | compared.unlike)] = FLOOR
     mask[above & sure] = NOT_FLOOR
@@ -217,17 +211,7 @@ def judge(frame: FrameEvidence, step_m: float) -> NDArray[np.uint8]:
     # where above a foot there is what stands on it.
     sill = compared.against & (np.abs(heights.height) <= np.float32(step_m))
     mask[may_be & sill & below_floor(mask)] = FLOOR
-    floor = mask == FLOOR
-    return without_floor(mask, ~most_around(floor, measured & (off | floor)))
-
-
-def most_around(said: NDArray[np.bool_], measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return around which pixels (R, W) most of what is measured (R, W) says something (R, W): some
-    of what is matched wrongly lies on the floor by chance.
-    """
-    window = (_WIDE_WINDOW, _WIDE_WINDOW)
-    of_all, of_said = (cv2.blur(part.astype(np.float32), window) for part in (measured, said))
-    return np.asarray(of_said >= np.float32(0.5) * of_all)
+    return mask
 
 
 def last_evidence(
