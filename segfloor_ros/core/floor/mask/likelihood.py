@@ -61,9 +61,8 @@ disparity. look: log ratio of how likely its brightness is of the floor to how o
 
 _HEIGHT, _LOOK = (list(WEIGHTS).index(name) for name in ('above', 'look'))
 
-_SURE, _HARDLY, _UNLIKELY = (math.log(p / (1 - p)) for p in (0.95, 0.73, 1 / 3))
-"""Log odds: what is more likely floor than the first is floor, what is less likely than the last is
-none, and of what only one camera sees what is less likely than the second."""
+_SURE = math.log(0.95 / 0.05)
+"""Log odds of what is surely floor; what is less likely than not is none."""
 _CARRY_PX = 20.0
 """So far a likelihood is carried where no edge is, in pixels of these pictures."""
 
@@ -235,7 +234,7 @@ class Likelihood:
         log_ratio = np.tensordot(self.weights, every, 1)
         near_enough = seen.floor_px > LEAST_FLOOR_PX
         judged = (known > LEAST_KNOWN) & near_enough
-        unlikely = judged & (log_ratio < _UNLIKELY)
+        unlikely = judged & (log_ratio < 0)
         is_higher = unlikely & (every[_HEIGHT] > SIGMAS)
         unlikely |= rims(is_higher, judged & (log_ratio > 0), seen)
         sure = judged & ~seen.lower & (log_ratio > _SURE)
@@ -243,7 +242,7 @@ class Likelihood:
         if one_sided.any():
             carried = carry(np.where(judged, log_ratio, 0), known * judged, seen)
             carried += every[_LOOK] / 2
-            unlikely |= one_sided & (carried < _HARDLY)
+            unlikely |= one_sided & (carried < 0)
             sure |= one_sided & (carried > _SURE)
         sure &= ~unlikely
         return with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))

@@ -232,20 +232,35 @@ def _seen(samples: Samples, planes: Array) -> tuple[Array, Array, NDArray[np.boo
     return error, expected, visible
 
 
-def scores(samples: Samples, angles_height: Array) -> Array:
+def scores(samples: Samples, angles_height: Array, drops: bool = False) -> Array:
     """Return how much of the samples' weight speaks for each plane (M, 3), less what speaks
     against it.
 
     The floor hides what is below it: a disparity clearly smaller than the plane's contradicts it.
+    drops: unless it is beyond what lies on the plane on average, where the floor may drop.
     """
     planes, total = plane_of(angles_height), np.zeros(len(angles_height))
-    for start in range(0, len(samples.weight), _AT_ONCE):
-        part = samples.take(slice(start, start + _AT_ONCE))
+    parts = [samples.take(slice(i, i + _AT_ONCE)) for i in range(0, len(samples.weight), _AT_ONCE)]
+    mean_px = _mean_on(parts, planes) if drops else None
+    for part in parts:
         error, limit, visible = _seen(part, planes)
-        below = np.float32(_VIOLATION_WEIGHT) * (error < limit)
+        below = error < limit
+        if mean_px is not None:
+            below &= part.disparity_px[:, None] - error >= mean_px
         on = 1 - np.minimum((error / np.float32(SAME_PX)) ** 2, 1)
-        total += part.weight @ ((on - below) * visible)
+        total += part.weight @ ((on - np.float32(_VIOLATION_WEIGHT) * below) * visible)
     return total
+
+
+def _mean_on(parts: Sequence[Samples], planes: Array) -> Array:
+    """Return the mean disparity (M,) of what lies on each plane m (M, 3), of samples in parts."""
+    sums = np.zeros((2, len(planes)))
+    for part in parts:
+        error, _, visible = _seen(part, planes)
+        on = visible & (np.abs(error) < SAME_PX)
+        sums += part.weight @ on, (part.weight * part.disparity_px) @ on
+    mean: Array = sums[1] / np.maximum(sums[0], 1e-9)
+    return mean
 
 
 def shares(samples: Samples, angles_height: Array) -> tuple[float, float]:
@@ -406,7 +421,21 @@ class FramePrior:
         self.means = np.vstack([expected[0], expected])
         self.sigmas = np.vstack([still, *len(expected) * [SWAY]])
         self.sigmas[:, 2] *= self.means[:, 2]
-        self._most = SURE if is_fixed else math.inf
+        self._is_fixed, self._most = is_fixed, SURE if is_fixed else math.inf
+
+    def log_posterior(self, samples: Samples, angles_height: Array) -> Array:
+        """Return the logarithms of the likelihood times the density (M,) of planes (M, 3).
+
+        Where a fixed camera is as it is mounted the plane is known: what lies below it is a drop.
+        """
+        density = self.log_density(angles_height)
+        if self._is_fixed:
+            density[:, 0] += _NATS * scores(samples, angles_height, drops=True)
+            density[:, 1:] += _NATS * scores(samples, angles_height)[:, None]
+        else:
+            density += _NATS * scores(samples, angles_height)[:, None]
+        posterior: Array = density.max(axis=1)
+        return posterior
 
     def log_density(self, angles_height: Array) -> Array:
         """Return the logarithms of the density of each component (M, P + 1) at planes (M, 3)."""
@@ -432,8 +461,8 @@ def _likeliest(samples: Samples, prior: FramePrior) -> Array:
     raised[:, 2] = -depth_m * (plane_of(raised) * samples.rays[on]).sum(axis=1)
     guesses = np.vstack([prior.means, drawn])
     guesses = guesses[plausible(guesses)]
-    likelihood = _NATS * scores(samples.every(int(_CORRELATED_SAMPLES)), guesses)
-    best: Array = guesses[np.argmax(likelihood + prior.log_density(guesses).max(axis=1))]
+    few = samples.every(int(_CORRELATED_SAMPLES))
+    best: Array = guesses[np.argmax(prior.log_posterior(few, guesses))]
     return best
 
 
@@ -445,7 +474,6 @@ def _refined(samples: Samples, guess: Array, prior: FramePrior) -> PlaneFit:
     expected = prior.means[nearest], prior.sigmas[nearest]
     unknown, still = np.full(3, np.nan), np.zeros((0, 3))
     fit = refine(samples, guess, unknown, still, *expected, NEAR_SCALES_PX)
-    plane = fit.angles_height[None]
-    evidence = _NATS * scores(samples, plane)[0] + prior.log_density(plane).max()
+    evidence = prior.log_posterior(samples, fit.angles_height[None])[0]
     evidence += np.log(fit.sigma).sum() + 1.5 * math.log(2 * math.pi)
     return replace(fit, evidence=float(evidence))
