@@ -295,7 +295,6 @@ def _seen(frame: FrameEvidence, mask: NDArray[np.uint8]) -> Seen:
         lower=(heights.off & ~heights.above)[half],
         left_only=columns < compared.floor_px,
         grey=grey.astype(np.float32),
-        better=compared.better,
         noise_grey=pair.noise_grey if pair.measured is None else 0.0,
         mask=mask[half],
     )

@@ -349,3 +349,15 @@ def test_measured_depth_may_be_nearer_than_any_floor(near_m):
     assert precision > 0.99
     assert recall > 0.95
     assert observation.max_disparity_px >= observation.disparity_px.max()
+
+
+@pytest.mark.parametrize(('near', 'below'), [(5.0, 30.0), (3.0, 8.0)])
+def test_a_drop_close_ahead_does_not_take_the_floor_before_it(near, below):
+    """What lies below has more texture, and a plane that is tilted and lowered would fit it."""
+    lower = floor_patch(near_m=0.8, height_m=-0.2, contrast=below)
+    lower = dataclasses.replace(lower, is_floor=False)
+    scene = Scene([floor_patch(far_m=0.8, contrast=near), lower, wall(4.0)])
+    observation, floor, depth = segment(scene)
+    assert np.mean(observation.mask[floor] == FLOOR) > 0.88
+    fallen = ~floor & (points_of(scene, depth)[..., 2] < 0)
+    assert np.mean(observation.mask[fallen] == FLOOR) < 0.02

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.contracts import FLOOR, NOT_FLOOR
 from segfloor_ros.core.floor.disparity.matching import (
-    BLOCK_PX,
     COARSE_BLOCK_PX,
     NOISE_PX,
     NOISE_SLOPE,
@@ -41,25 +40,14 @@ from segfloor_ros.core.geometry import Array
 
 Picture = NDArray[np.float32]
 
-WEIGHTS = {
-    'one': 1.27,
-    'above': -0.34,
-    'rises': 1.27,
-    'steep': -1.17,
-    'on': 1.61,
-    'matched': -1.14,
-    'look': 0.95,
-}
+WEIGHTS = {'one': 0.76, 'above': -0.36, 'rises': 1.28, 'steep': -1.12, 'on': 2.05, 'look': 1.07}
 """By feature, made by `tools/fit_floor.py`.
 
 one: of a pixel that shows nothing. above: by how many sigmas it is higher than the floor around it.
 rises, steep: log ratio of likelihoods that the disparity rises down the image as a floor's, or as
 that of what is upright. on: share of what is around it that is on that floor, less that which is
-off. matched: log ratio of the difference of both images on the floor to that at the matched
-disparity. look: log ratio of how likely its brightness is of the floor to how often it is seen.
+off. look: log likelihood of its brightness as of the floor.
 """
-
-_HEIGHT, _LOOK = (list(WEIGHTS).index(name) for name in ('above', 'look'))
 
 _SURE = math.log(0.95 / 0.05)
 """Log odds of what is surely floor; what is less likely than not is none."""
@@ -73,18 +61,14 @@ _NOTHING = 0.02
 _BLOCK, _NEAR, _WIDE = (COARSE_BLOCK_PX, COARSE_BLOCK_PX), (5, 5), (9, 9)
 """Columns and rows of the block that is matched, and of the windows over which pixels are averaged,
 and are counted."""
-_MOST_PX, _MOST_SIGMAS, _MOST_NATS = 30.0, 12.0, 6.0
+_MOST_SIGMAS, _MOST_NATS = 12.0, 6.0
 """No feature says more: what is wrong is then as wrong as it can be."""
-_WELL_KNOWN = 0.3
-"""What is known as well as this on average says all that it can."""
 _UNEVEN_PX = 0.05, 1.4
 """How uneven the disparities of floors are, at least and at most."""
 _RISE_SIGMA_PX = 0.7, 2.0
 """Error of the difference of two disparities, at least and at most."""
-_BINS, _END = 2, 10
-"""Of the histogram of brightness, per sigma of the floor's; it ends at so many sigmas."""
-_LOOK_NATS = -4.0, 3.0
-"""Bounds of what a look says."""
+_LEAST_LOOK = -4.0
+"""No brightness says more against a floor."""
 
 
 @dataclass(frozen=True)
@@ -94,10 +78,8 @@ class Seen:
     floor_px, disparity_px: disparity of the floor, and the matched one, 0 where none is. slope: of
     a floor's disparity, per row of the image. texture: as many times of what is surely no noise.
     lower: bool, what lies deeper than a robot may drop. left_only: bool, what the right camera does
-    not see if it is floor. grey: brightness, smoothed. better: log
-    ratio of how much the images differ on the floor to how much they do as matched. noise_grey: of
-    the images, 0 of depth that is measured. mask: uint8, what
-    is floor so far, and what is not.
+    not see if it is floor. grey: brightness, smoothed. noise_grey: of the images, 0 of depth that
+    is measured. mask: uint8, what is floor so far, and what is not.
     """
 
     floor_px: Picture
@@ -107,7 +89,6 @@ class Seen:
     lower: NDArray[np.bool_]
     left_only: NDArray[np.bool_]
     grey: Picture
-    better: Picture
     noise_grey: float
     mask: NDArray[np.uint8]
 
@@ -135,7 +116,6 @@ def features(seen: Seen, weight: Picture) -> Picture:
     `known_weight`.
     """
     known = (seen.disparity_px > 0).astype(np.float32)
-    one = np.ones_like(known)
     height, mostly_on = _height(seen, weight)
     rises = _rise(seen, weight, known)
     # What is as level as a floor is none where it is higher, and what stands on it is higher.
@@ -143,7 +123,7 @@ def features(seen: Seen, weight: Picture) -> Picture:
     rises *= np.where(rises > 0, is_level, (1 - is_level) * (height > 0))
     positive = (np.maximum(values, 0) for values in (height, rises, -rises, mostly_on))
     look = _look(seen.grey, seen.is_floor)
-    return np.stack([one, *positive, seen.better * known, look])
+    return np.stack([np.ones_like(known), *positive, look])
 
 
 def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, float]) -> np.float32:
@@ -164,10 +144,11 @@ def _height(seen: Seen, weight: Picture) -> tuple[Picture, Picture]:
     that is higher.
     """
     known = (seen.disparity_px > 0).astype(np.float32)
-    above = np.clip(seen.disparity_px - seen.floor_px, -_MOST_PX, _MOST_PX) * known
+    most_px = _MOST_SIGMAS * SAME_PX
+    above = np.clip(seen.disparity_px - seen.floor_px, -most_px, most_px) * known
     share = cv2.blur(weight, _BLOCK)
     mean = cv2.blur(weight * above, _BLOCK) / np.maximum(share, np.float32(_NOTHING))
-    floor, sigma, lowest = np.zeros_like(above), NOISE_PX, -_MOST_PX
+    floor, sigma, lowest = np.zeros_like(above), NOISE_PX, -2 * most_px
     for _ in range(_ROUNDS):
         gap = mean - floor
         on = share * ((gap < SIGMAS * sigma) & (gap > lowest))
@@ -179,7 +160,7 @@ def _height(seen: Seen, weight: Picture) -> tuple[Picture, Picture]:
     height = np.clip(gap / np.float32(sigma), -_MOST_SIGMAS, _MOST_SIGMAS)
     on_off = np.where(np.abs(height) < SIGMAS, weight, -weight)
     mostly_on = mean_of_known(on_off, known, _WIDE)[0]
-    return height * np.minimum(share / np.float32(_WELL_KNOWN), 1), mostly_on
+    return height * np.minimum(share / np.float32(LEAST_KNOWN), 1), mostly_on
 
 
 def _rise(seen: Seen, weight: Picture, known: Picture) -> Picture:
@@ -203,16 +184,11 @@ def _rise(seen: Seen, weight: Picture, known: Picture) -> Picture:
 
 
 def _look(grey: Picture, is_floor: NDArray[np.bool_]) -> Picture:
-    """Return the log ratio of how likely the brightness of each pixel is of the floor to how often
-    one so far from the floor's is seen; 0 where no floor is known.
+    """Return the log likelihood of the brightness of each pixel as of the floor, 1 at its mean; 0
+    where no floor is known.
     """
-    sigmas = sigmas_off_floor(grey, is_floor, STEP_PX)
-    bins = np.clip(sigmas * _BINS + _END * _BINS + 0.5, 0, 2 * _END * _BINS).astype(np.intp)
-    often = np.bincount(bins[::2, ::2].ravel(), minlength=2 * _END * _BINS + 1) + 1.0
-    often = np.convolve(often, (0.25, 0.5, 0.25), 'same')
-    log_often = np.log(often * (_BINS / often.sum())).astype(np.float32)
-    ratio = -0.5 * sigmas**2 - np.float32(0.5 * math.log(2 * math.pi)) - log_often[bins]
-    look: Picture = np.clip(ratio, *_LOOK_NATS) * is_floor.any()
+    squares = sigmas_off_floor(grey, is_floor, STEP_PX) ** 2
+    look: Picture = np.maximum(1 - squares / 2, np.float32(_LEAST_LOOK)) * is_floor.any()
     return look
 
 
@@ -235,40 +211,18 @@ class Likelihood:
         near_enough = seen.floor_px > LEAST_FLOOR_PX
         judged = (known > LEAST_KNOWN) & near_enough
         unlikely = judged & (log_ratio < 0)
-        is_higher = unlikely & (every[_HEIGHT] > SIGMAS)
-        unlikely |= rims(is_higher, judged & (log_ratio > 0), seen)
+        # At the border of a thing the block that is matched holds both, and its foot is no higher.
+        is_higher = unlikely & (every[1] > SIGMAS)
+        unlikely |= cv2.dilate(is_higher.view(np.uint8), np.ones(_BLOCK, np.uint8)) > 0
         sure = judged & ~seen.lower & (log_ratio > _SURE)
         one_sided = seen.left_only & near_enough & ~judged
         if one_sided.any():
             carried = carry(np.where(judged, log_ratio, 0), known * judged, seen)
-            carried += every[_LOOK] / 2
+            carried += every[-1] / 2
             unlikely |= one_sided & (carried < 0)
             sure |= one_sided & (carried > _SURE)
         sure &= ~unlikely
         return with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))
-
-
-def rims(higher: NDArray[np.bool_], likely: NDArray[np.bool_], seen: Seen) -> NDArray[np.bool_]:
-    """Return what lies around things (h, w) and looks like them rather than like the likely floor
-    next to it: the foot of a thing is no higher than a floor, and at its border the block that is
-    matched holds both.
-    """
-    grey, reach = seen.grey, np.ones((2 * COARSE_BLOCK_PX - 1,) * 2, np.uint8)
-    (of_thing, _), (of_floor, variance) = (_around(grey, part) for part in (higher, likely))
-    noise = (2 * seen.noise_grey / BLOCK_PX) ** 2
-    like_thing = (grey - of_thing) ** 2 < (grey - of_floor) ** 2 + variance / 4 + noise
-    alone = cv2.blur(likely.astype(np.float32), _WIDE) < _NOTHING
-    near = cv2.dilate(higher.view(np.uint8), reach) > 0
-    found: NDArray[np.bool_] = near & (like_thing | alone)
-    return found
-
-
-def _around(grey: Picture, where: NDArray[np.bool_]) -> tuple[Picture, Picture]:
-    """Return mean and variance of grey levels around each pixel, of those pixels that are set."""
-    part = where.astype(np.float32)
-    share = np.maximum(cv2.blur(part, _WIDE), np.float32(1e-3))
-    mean, square = (cv2.blur(part * grey**power, _WIDE) / share for power in (1, 2))
-    return mean, np.maximum(square - mean**2, 0)
 
 
 def carry(log_ratio: Picture, weight: Picture, seen: Seen) -> Picture:
@@ -276,37 +230,35 @@ def carry(log_ratio: Picture, weight: Picture, seen: Seen) -> Picture:
     from spreading; toward 0 where nothing is near. weight: of what is known.
 
     The normalised convolution of Gastal and Oliveira, Domain Transform for Edge-Aware Image and
-    Video Processing (2011), of a quarter of the resolution, along rows and then along columns.
-    What stands is no floor, however little of it is measured.
+    Video Processing (2011), at half of this resolution, along rows and then along columns. What
+    stands is no floor, however little of it is measured.
     """
-    stands = seen.mask == NOT_FLOOR
-    weight = np.where(stands, np.float32(1), np.minimum(weight / np.float32(0.5), 1))
-    values = np.where(stands, np.float32(-_MOST_NATS), np.clip(log_ratio, -_MOST_NATS, _MOST_NATS))
     # Farther from these columns nothing gets there.
     reach = int(np.flatnonzero(seen.left_only.any(axis=0))[-1]) + 2 * round(_CARRY_PX)
-    parts = np.stack([values * weight, weight])[:, :, :reach]
-    size = parts.shape[:0:-1]
-    parts = np.stack([cv2.blur(part, (3, 3))[::2, ::2] for part in parts])
-    level = np.log(cv2.GaussianBlur(seen.grey[:, :reach], (3, 3), 0)[::2, ::2] + 8)
-    steps = [np.abs(np.diff(level, axis=i, prepend=np.take(level, [0], axis=i))) for i in (1, 0)]
-    floor = parts[1] > LEAST_KNOWN
-    own = np.median(np.concatenate([step[floor] for step in steps])) if floor.any() else 1.0
-    for step, axis in zip(steps, (1, 0), strict=True):
-        kept = np.exp(-(2 / _CARRY_PX + np.maximum(step / (2 * max(own, 1e-3)) - 1, 0)))
+    part = np.s_[:, :reach]
+    stands = seen.mask[part] == NOT_FLOOR
+    weight = np.where(stands, np.float32(1), weight[part])
+    bounded = np.clip(np.where(stands, -_MOST_NATS, log_ratio[part]), -_MOST_NATS, _MOST_NATS)
+    level = np.log(seen.grey[part] + 8)
+    few = [cv2.blur(one, (3, 3))[::2, ::2] for one in (bounded * weight, weight, level)]
+    parts = np.stack(few[:2])
+    steps = [np.abs(np.diff(few[2], axis=axis, prepend=few[2].max())) for axis in (1, 0)]
+    own = np.median(np.minimum(*steps)[parts[1] > LEAST_KNOWN].tolist() or 1.0)
+    for step, axis in zip(steps, (2, 1), strict=True):
+        kept = np.exp(-2 / _CARRY_PX - np.maximum(step / (2 * max(own, 1e-3)) - 1, 0))
         parts = _spread_along(parts, kept.astype(np.float32), axis)
-    carried = cv2.resize(parts[0] / (parts[1] + np.float32(_NOTHING)), size)
-    whole = np.zeros_like(log_ratio)
-    whole[:, :reach] = carried
-    return whole
+    carried = np.zeros_like(log_ratio)
+    carried[part] = cv2.resize(parts[0] / (parts[1] + np.float32(_NOTHING)), stands.shape[::-1])
+    return carried
 
 
 def _spread_along(parts: Picture, kept: Picture, axis: int) -> Picture:
     """Return pictures (n, h, w) with what comes from both sides along an axis; kept: (h, w), which
     share of that is left from the pixel before on.
     """
-    lines, share = np.moveaxis(parts, axis + 1, 0), np.moveaxis(kept, axis, 0)
+    lines, share = np.moveaxis(parts, axis, 0), np.moveaxis(kept, axis - 1, 0)
     forth, back = lines.copy(), lines.copy()
     for i in range(1, len(lines)):
         forth[i] += share[i] * forth[i - 1]
         back[-1 - i] += share[-i] * back[-i]
-    return np.moveaxis(forth + back - lines, 0, axis + 1)
+    return np.moveaxis(forth + back - lines, 0, axis)

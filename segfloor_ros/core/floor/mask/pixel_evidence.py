@@ -66,9 +66,6 @@ _MARGIN_PX = 4.0
 _NOISE_SHARE = 2.0
 """Two images of the same thing differ by 1.13 sigma of noise on average, and by interpolation."""
 
-_UNEQUAL_GREY = 0.8, 0.3
-"""Mean difference of both images of the same thing: so many sigmas of noise, and grey levels."""
-
 _UPRIGHT_WINDOW = 7, 5
 """Columns and rows of the window above the contact in which the upright surface is measured."""
 _GAP_ROWS = 2
@@ -84,7 +81,6 @@ class Comparison:
     against: clearly more like the matched disparity than like floor. denied: the same of the
     surroundings taken together. unlike: unlike floor, whatever it is. consistent: may be floor, not
     denied.
-    better: float32 as floor_px, `matched_better`.
     """
 
     floor_px: NDArray[np.float32]
@@ -92,7 +88,6 @@ class Comparison:
     denied: NDArray[np.bool_]
     unlike: NDArray[np.bool_]
     consistent: NDArray[np.bool_]
-    better: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -294,8 +289,7 @@ def compare(
     if pair.measured is not None:
         off_px = np.abs(disparity - profile.at_pixels(view.derolled))
         against = (disparity > 0) & (off_px > np.float32(SAME_PX)) & ~on_floor
-        nowhere, nothing = np.zeros_like(against), np.zeros_like(floor_px)
-        return Comparison(floor_px, against, against, nowhere, ~against, nothing)
+        return Comparison(floor_px, against, against, np.zeros_like(against), ~against)
     left, right, noise_grey = pair.left_rows, pair.right[pair.part[0]], pair.noise_grey
     sampled = left[::STEP_PX, ::STEP_PX]
     rows, columns = STEP_PX * np.indices(sampled.shape, np.float32)
@@ -323,23 +317,7 @@ def compare(
     against, denied, unlike, contrary = (
         enlarged(mask & reached, disparity) for mask in (against, denied, unlike, contrary)
     )
-    better = matched_better(floor, matched, reached, noise_grey)
-    return Comparison(floor_px, against, denied, unlike, ~contrary, better)
-
-
-def matched_better(
-    floor: NDArray[np.float32],
-    matched: NDArray[np.float32],
-    reached: NDArray[np.bool_],
-    noise_grey: float,
-) -> NDArray[np.float32]:
-    """Return the log ratio of how much the images differ on the floor, in grey levels (R, W), to
-    how much they do as matched; 0 where the right image does not reach.
-    """
-    sigmas, grey = _UNEQUAL_GREY
-    noise = np.float32(sigmas * noise_grey + grey)
-    ratio = np.log((floor + noise) / (np.minimum(matched, floor) + noise))
-    return np.asarray(ratio * reached)
+    return Comparison(floor_px, against, denied, unlike, ~contrary)
 
 
 def _foreign(

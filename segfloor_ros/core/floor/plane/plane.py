@@ -241,12 +241,10 @@ def scores(samples: Samples, angles_height: Array, drops: bool = False) -> Array
     """
     planes, total = plane_of(angles_height), np.zeros(len(angles_height))
     parts = [samples.take(slice(i, i + _AT_ONCE)) for i in range(0, len(samples.weight), _AT_ONCE)]
-    mean_px = _mean_on(parts, planes) if drops else None
+    mean_px = _mean_on(parts, planes) if drops else np.zeros(len(planes))
     for part in parts:
         error, limit, visible = _seen(part, planes)
-        below = error < limit
-        if mean_px is not None:
-            below &= part.disparity_px[:, None] - error >= mean_px
+        below = (error < limit) & (part.disparity_px[:, None] - error >= mean_px)
         on = 1 - np.minimum((error / np.float32(SAME_PX)) ** 2, 1)
         total += part.weight @ ((on - np.float32(_VIOLATION_WEIGHT) * below) * visible)
     return total
@@ -428,14 +426,11 @@ class FramePrior:
 
         Where a fixed camera is as it is mounted the plane is known: what lies below it is a drop.
         """
-        density = self.log_density(angles_height)
+        likelihood = np.repeat(scores(samples, angles_height)[:, None], len(self.means), axis=1)
         if self._is_fixed:
-            density[:, 0] += _NATS * scores(samples, angles_height, drops=True)
-            density[:, 1:] += _NATS * scores(samples, angles_height)[:, None]
-        else:
-            density += _NATS * scores(samples, angles_height)[:, None]
-        posterior: Array = density.max(axis=1)
-        return posterior
+            likelihood[:, 0] = scores(samples, angles_height, drops=True)
+        best: Array = (_NATS * likelihood + self.log_density(angles_height)).max(axis=1)
+        return best
 
     def log_density(self, angles_height: Array) -> Array:
         """Return the logarithms of the density of each component (M, P + 1) at planes (M, 3)."""
