@@ -45,7 +45,13 @@ from segfloor_ros.core.floor.mask.filling import (
 from segfloor_ros.core.floor.mask.likelihood import Likelihood, Seen
 from segfloor_ros.core.floor.mask.look import unlike_floor
 from segfloor_ros.core.floor.mask.painting import with_floor, without_floor
-from segfloor_ros.core.floor.mask.pixel_evidence import FrameEvidence, Heights, compare, judge
+from segfloor_ros.core.floor.mask.pixel_evidence import (
+    FrameEvidence,
+    Heights,
+    below_floor,
+    compare,
+    judge,
+)
 from segfloor_ros.core.floor.pair import Pair
 from segfloor_ros.core.floor.plane.plane import PROVED, Fixture, expectations, plane_of_frame
 from segfloor_ros.core.floor.scan import FloorScanner, OverheadMatcher
@@ -276,6 +282,10 @@ def _judged(frame: FrameEvidence, step_m: float) -> tuple[NDArray[np.uint8], NDA
     pair = frame.pair
     mask = trim_to_edges(judge(frame, step_m), pair.slope)
     odd = unlike_floor(pair.left[pair.part], mask == FLOOR)
+    # What stands may look like that, and what is measured to be floor stays so.
+    doubtful = (mask == FLOOR) & odd
+    mask = without_floor(mask, doubtful)
+    mask = with_floor(mask, doubtful & ~frame.heights.mean_off & below_floor(mask))
     mask = pair.without_hidden(mask)
     if pair.said_there is not None:
         mask[pair.said_there == NOT_FLOOR] = NOT_FLOOR

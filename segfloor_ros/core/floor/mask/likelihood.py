@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from segfloor_ros.core.contracts import FLOOR, NOT_FLOOR
 from segfloor_ros.core.floor.disparity.matching import (
     COARSE_BLOCK_PX,
+    MEAN_NOISE,
     NOISE_PX,
     NOISE_SLOPE,
     SAME_PX,
@@ -63,8 +64,8 @@ _BLOCK, _NEAR, _WIDE = (COARSE_BLOCK_PX, COARSE_BLOCK_PX), (5, 5), (9, 9)
 and are counted."""
 _MOST_SIGMAS, _MOST_NATS = 12.0, 6.0
 """No feature says more: what is wrong is then as wrong as it can be."""
-_UNEVEN_PX = 0.05, 1.4
-"""How uneven the disparities of floors are, at least and at most."""
+_UNEVEN_PX = MEAN_NOISE * NOISE_PX, 1.4
+"""How uneven the disparities of floors are, at least, as neighbours err together, and at most."""
 _RISE_SIGMA_PX = 0.7, 2.0
 """Error of the difference of two disparities, at least and at most."""
 _LEAST_LOOK = -4.0
@@ -217,7 +218,8 @@ class Likelihood:
         sure = judged & ~seen.lower & (log_ratio > _SURE)
         one_sided = seen.left_only & near_enough & ~judged
         if one_sided.any():
-            carried = carry(np.where(judged, log_ratio, 0), known * judged, seen)
+            values = np.where(seen.lower, np.float32(-_MOST_NATS), log_ratio)
+            carried = carry(values, known * judged, seen)
             carried += every[-1] / 2
             unlikely |= one_sided & (carried < 0)
             sure |= one_sided & (carried > _SURE)
