@@ -43,7 +43,7 @@ $(VENV)/bin/python:
 $(STAMP): constraints.txt setup.py setup.cfg pyproject.toml | $(VENV)/bin/python
 	$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt pip setuptools
 	$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt \
-	  --no-build-isolation -e '.[ros,cli,sim,cluster,dev]'
+	  --no-build-isolation -e '.[ros,evaluate,sim,cluster,dev]'
 	@touch $@
 
 # The message of /tf, which the wheels lack; where it cannot be built, one line says why.
@@ -80,7 +80,7 @@ $(NOBLE)/.installed: constraints-noble.txt constraints.txt setup.py setup.cfg py
 	$(NOBLE)/bin/python -m pip install -q --disable-pip-version-check \
 	  -c $(NOBLE)/constraints.txt pip setuptools
 	$(NOBLE)/bin/python -m pip install -q --disable-pip-version-check \
-	  -c $(NOBLE)/constraints.txt --no-build-isolation -e '.[ros,cli,sim,cluster,test]'
+	  -c $(NOBLE)/constraints.txt --no-build-isolation -e '.[ros,evaluate,sim,cluster,test]'
 	@$(NOBLE)/bin/python tools/tf2_msgs/build.py
 	@touch $@
 

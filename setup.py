@@ -1,5 +1,6 @@
 """Build description for pip and for colcon (ament_python)."""
 
+import os
 import re
 import sys
 from pathlib import Path
@@ -49,8 +50,14 @@ setup(
     long_description=(HERE / 'README.md').read_text() if (HERE / 'README.md').exists() else '',
     long_description_content_type='text/markdown',
     license='Apache-2.0',
-    maintainer='Segfloor maintainers',
-    maintainer_email='segfloor@example.org',
+    maintainer='segfloor_ros maintainers',
+    url=os.environ.get('REPOSITORY_URL'),  # set by the workflow that publishes
+    classifiers=[
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3',
+        'Topic :: Scientific/Engineering',
+    ],
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
         f'{PACKAGE}.apps.simulation': [
@@ -63,31 +70,35 @@ setup(
             'robot.xml',
         ],
         f'{PACKAGE}.apps.evaluation': ['report.css'],
+        f'{PACKAGE}.apps.cli': ['map_editor.html'],
         f'{PACKAGE}.nodes': ['fastdds.xml'],
         f'{PACKAGE}.core.slam.places': ['vocabulary.npy'],
     },
     data_files=data_files,
     python_requires='>=3.10',
-    # colcon does not install these: on a ROS install rosdep brings the distribution's own packages,
-    # which those of pip must not shadow.
-    install_requires=['numpy>=1.26', 'scipy>=1.11', 'pyyaml>=6.0', 'opencv-python-headless>=4.6'],
+    # What the nodes need, then what the command needs. colcon does not install these: on a ROS
+    # install rosdep brings the distribution's own packages, which those of pip must not shadow.
+    install_requires=[
+        'numpy>=1.26',
+        'scipy>=1.11',
+        'pyyaml>=6.0',
+        'opencv-python-headless>=4.6',
+        'typer>=0.12',
+        'rich>=13',
+        'matplotlib>=3.6',
+        'rosbags>=0.10',
+        'mcap>=1.1',
+        'zstandard>=0.19',
+        'junitparser>=3',
+    ],
     extras_require={
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
-        'cli': [
-            'typer>=0.12',
-            'rich>=13',
-            'rosbags>=0.10',
-            'mcap>=1.1',
-            'zstandard>=0.19',
-            'evo>=1.28',
-            'matplotlib>=3.6',
-            'junitparser>=3',
-        ],
+        'evaluate': ['evo>=1.28'],
         'cluster': ['distributed>=2024.5', 'fsspec>=2024.5'],
         'sim': ['mujoco>=3.3'],
         'onnx': ['onnxruntime>=1.17'],
         'view': ["rerun-sdk>=0.41; python_version >= '3.11'"],
-        'all': ['segfloor_ros[ros,cli,cluster,sim,view]'],
+        'all': ['segfloor_ros[ros,evaluate,cluster,sim,view]'],
         # colcon takes the tests to be pytest's by this name.
         'test': ['onnx>=1.16', 'pytest', 'pytest-timeout', 'pytest-xdist'],
         'dev': [

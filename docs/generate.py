@@ -45,6 +45,7 @@ and on `/tf_static` the mount where tf lacks it; where the camera's frame has a 
 the root of that tree is put on the base. With `publish_odom_tf: false` another node owns `odom` →
 `base_link`, e.g. robot_localization with wheels and IMU: `map` → `odom` is then what lies between
 that node's base and the one SLAM sees at the same time, and stays as it was while tracking is lost.
+Let such a filter use the velocity of `odometry`: the covariance of its pose grows along the way.
 tf needs tf2_msgs, which ROS has; with pip wheels `make` builds it.""",
     FLOOR: """\
 Computes the disparity of every keyframe and marks the pixels that show floor.""",

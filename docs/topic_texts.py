@@ -22,13 +22,16 @@ ABOUT = {
     'ground_truth': 'Where base_link truly is in world, at every image.',
     'contact': 'When the robot runs into something, where, in base_link (m).',
     'odometry': (
-        'Every tracked frame: base_link in odom (continuous), covariance, velocity. Silent while '
-        'lost.'
+        'Every tracked frame: base_link in odom (continuous), with a covariance that grows as odom '
+        'drifts, and the velocity with its own. Silent while lost.'
     ),
     'initialpose': (
         'About where base_link is in map, as RViz publishes it: the camera is looked for there.'
     ),
-    'pose': 'Every tracked frame: base_link in map. Published while someone listens.',
+    'pose': (
+        'Every tracked frame: base_link in map, with its covariance in the map around it. '
+        'Published while someone listens.'
+    ),
     'odometry/corrected': (
         'What came on odometry before the mount of the camera was known, or the map was found '
         'again: the same frames, corrected once; and frames that saw the place before it was '

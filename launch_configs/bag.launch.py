@@ -15,7 +15,7 @@ ARGUMENTS = {
     'delay': ('5.0', 'Seconds until the player begins, so that the nodes are connected.'),
     'namespace': ('', 'Namespace of all nodes and topics.'),
     'params_file': (['params', 'default.yaml'], 'Parameter file for all nodes.'),
-    'composed': ('false', 'Run all nodes in one process, for small machines: true or false.'),
+    'composed': ('false', 'Run all nodes as one program, for small machines: true or false.'),
     'log_level': ('info', 'From which level on the nodes log.'),
     'left_image': ('', 'Topic of the left images, by default left/image_raw or left/image_rect.'),
     'right_image': ('', 'Topic of the right images.'),

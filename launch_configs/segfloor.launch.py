@@ -120,7 +120,7 @@ ARGUMENTS = {
         'false',
         'Only find the robot in the map of load_map, and add nothing to it: true or false.',
     ),
-    'composed': ('false', 'Run all nodes in one process, for small machines: true or false.'),
+    'composed': ('false', 'Run all nodes as one program, for small machines: true or false.'),
     'autostart': (
         'true',
         'Nodes begin to work by themselves: true, or false, with which they wait for a lifecycle '

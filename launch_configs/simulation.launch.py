@@ -14,7 +14,7 @@ ARGUMENTS = {
     'robot': ('turtlebot3_burger', 'The robot: turtlebot3_burger or husky.'),
     'namespace': ('', 'Namespace of all nodes and topics.'),
     'params_file': (['params', 'simulation.yaml'], 'Parameter file for all nodes.'),
-    'composed': ('false', 'Run the mapping nodes in one process: true or false.'),
+    'composed': ('false', 'Run the mapping nodes as one program: true or false.'),
     'load_map': ('', 'Saved map to go on with; empty: begin with an empty one.'),
     'log_level': ('info', 'From which level on the nodes log.'),
     'rviz': ('false', 'Show the map in RViz: true or false.'),

@@ -2,7 +2,7 @@
 
 import os
 
-__version__ = '0.1.0'
+__version__ = '0.2.0'
 
 MAX_PIXELS = 50_000_000
 """Larger images are refused: a damaged header must not take all memory."""

@@ -13,6 +13,7 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
 from segfloor_ros.apps.recordings import StereoSource, open_source
+from segfloor_ros.apps.recordings.bag import ODOMETRY_TYPE, TF_TYPE
 from segfloor_ros.apps.recordings.calibration_files import write_ros_calibration
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.settings import StereoCameraSettings
@@ -211,6 +212,53 @@ def stereo_messages(
             messages.append(info_message(info, stamp_ns, eye))
             messages.append(image_message(topic, stamp_ns, image, encoding))
     return messages
+
+
+def odometry_message(topic: str, stamp_ns: int, x_m: float, frame: str = 'odom') -> Message:
+    """Return an Odometry of `base_link`, x_m ahead."""
+
+    def make(types: Any, header: Any) -> Any:
+        vector = types['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)
+        pose = types['geometry_msgs/msg/Pose'](
+            types['geometry_msgs/msg/Point'](x_m, 0.0, 0.0),
+            types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0),
+        )
+        stamped = header(stamp_ns)
+        stamped.frame_id = frame
+        return types[ODOMETRY_TYPE](
+            header=stamped,
+            child_frame_id='base_link',
+            pose=types['geometry_msgs/msg/PoseWithCovariance'](pose, np.zeros(36)),
+            twist=types['geometry_msgs/msg/TwistWithCovariance'](
+                types['geometry_msgs/msg/Twist'](vector, vector), np.zeros(36)
+            ),
+        )
+
+    return Message(topic, ODOMETRY_TYPE, stamp_ns, make)
+
+
+def transform_message(
+    parent: str,
+    child: str,
+    translation: tuple[float, float, float],
+    quat_xyzw: tuple[float, float, float, float],
+) -> Message:
+    """Return a fixed transform: where `child` is in `parent`."""
+
+    def make(types: Any, header: Any) -> Any:
+        stamped = header(0)
+        stamped.frame_id = parent
+        transform = types['geometry_msgs/msg/TransformStamped'](
+            header=stamped,
+            child_frame_id=child,
+            transform=types['geometry_msgs/msg/Transform'](
+                types['geometry_msgs/msg/Vector3'](*translation),
+                types['geometry_msgs/msg/Quaternion'](*quat_xyzw),
+            ),
+        )
+        return types[TF_TYPE]([transform])
+
+    return Message('/tf_static', TF_TYPE, 0, make)
 
 
 def write_rosbag2(path: Path, messages: Iterable[Message], plugin: str = 'mcap') -> Path:

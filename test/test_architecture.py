@@ -46,7 +46,7 @@ CEILINGS = {
     'core.cloud': 750,
     'core.grid.mapper': 1400,
     'nodes.stereo_camera': 3650,
-    'nodes.stereo_slam': 9900,
+    'nodes.stereo_slam': 9800,
     'nodes.floor_segmentation': 4900,
     'nodes.cloud_labelling': 3050,
     'nodes.occupancy_grid': 3400,

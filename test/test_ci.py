@@ -7,6 +7,7 @@ import importlib
 import re
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -19,13 +20,35 @@ PAGE = (REPOSITORY / 'docs' / 'ci.md').read_text()
 SCRIPTS = sorted(p for p in (REPOSITORY / '.ci').iterdir() if not p.suffix)
 
 
-@pytest.mark.parametrize('workflow', ['pip', 'ros'])
+WORKFLOWS = REPOSITORY / '.github' / 'workflows'
+
+
+def steps_of(workflow: str) -> list[dict[str, Any]]:
+    jobs = yaml.safe_load((WORKFLOWS / f'{workflow}.yml').read_text())['jobs'].values()
+    return [step for job in jobs for step in job['steps']]
+
+
+@pytest.mark.parametrize('workflow', ['pip', 'ros', 'release'])
 def test_workflows_call_scripts_that_there_are(workflow) -> None:
-    text = (REPOSITORY / '.github' / 'workflows' / f'{workflow}.yml').read_text()
-    (job,) = yaml.safe_load(text)['jobs'].values()
-    called = re.findall(r'\.ci/([\w-]+)', ' '.join(step.get('run', '') for step in job['steps']))
+    words = ' '.join(step.get('run', '') for step in steps_of(workflow))
+    called = re.findall(r'\.ci/([\w-]+)', words)
     assert called
     assert set(called) <= {script.name for script in SCRIPTS}
+
+
+def test_what_is_published_is_what_was_built_and_tried_and_no_token_is_kept() -> None:
+    text = (WORKFLOWS / 'release.yml').read_text()
+    build, publish = yaml.safe_load(text)['jobs'].values()
+    assert publish['needs'] == 'build' and publish['permissions'] == {'id-token': 'write'}
+    uploaded, downloaded = build['steps'][-1]['with'], publish['steps'][0]['with']
+    assert uploaded == downloaded
+    assert 'secrets.' not in text
+
+
+def test_both_containers_are_built() -> None:
+    jobs = yaml.safe_load((WORKFLOWS / 'containers.yml').read_text())['jobs']
+    built = {one['file'] for one in jobs['build']['strategy']['matrix']['include']}
+    assert built == {path.name for path in (REPOSITORY / 'docker').glob('*Dockerfile')}
 
 
 @pytest.mark.parametrize('script', SCRIPTS, ids=lambda path: path.name)

@@ -17,7 +17,7 @@ from segfloor_ros.apps.simulation import scene as scene_module
 from segfloor_ros.apps.simulation.scene import Scene
 from segfloor_ros.apps.simulation.scene_file import scene_from_mapping, shipped
 from segfloor_ros.apps.simulation.textures import GENERATORS
-from segfloor_ros.nodes.configuration import NODE_SETTINGS, STAGE_SETTINGS
+from segfloor_ros.nodes.configuration import NODE_SETTINGS, STAGE_SETTINGS, resolve
 from tools import figures
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'
@@ -119,6 +119,26 @@ def test_the_parameters_of_the_page_exist() -> None:
     page = (DOCS / 'robot.md').read_text()
     assert all(name in page for name in named)
     assert named <= known
+
+
+BASIC = DOCS.parent / 'params' / 'basic.yaml'
+
+
+def test_the_basic_settings_are_few_have_their_defaults_and_are_those_of_the_page() -> None:
+    resolved = resolve(BASIC, ())
+    known = resolve(None, ()).as_ros_parameters()
+    assert str(resolved.as_ros_parameters()) == str(known)
+    sections = {
+        name.removeprefix('/**').removeprefix('/'): set(section['ros__parameters'])
+        for name, section in yaml.safe_load(BASIC.read_text()).items()
+    }
+    of_all = sections.pop('')
+    for node, names in sections.items():
+        specs = (*STAGE_SETTINGS[node].specs(), *NODE_SETTINGS[node].specs())
+        assert names <= {spec.name for spec in specs}
+        assert len(names | of_all & {spec.name for spec in specs}) <= 12
+    rows = table_rows((DOCS / 'settings.md').read_text())
+    assert set().union(*rows) - STAGE_SETTINGS.keys() == set().union(of_all, *sections.values())
 
 
 @pytest.mark.parametrize('page', figures.PAGES, ids=lambda path: path.name)

@@ -16,6 +16,9 @@ from pathlib import Path
 
 import pytest
 
+from segfloor_ros import __version__
+from segfloor_ros.apps.cli.main import EXTRAS
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 NODES = ('stereo_camera', 'stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid')
 IMPORT_OF_KEY = {'python3-numpy': 'numpy', 'python3-opencv': 'cv2', 'python3-scipy': 'scipy',
@@ -109,8 +112,6 @@ def test_the_manifest_is_what_the_build_tools_accept() -> None:
 
 
 def test_one_version_everywhere() -> None:
-    from segfloor_ros import __version__
-
     assert manifest().findtext('version') == __version__
 
 
@@ -148,10 +149,42 @@ def test_what_pip_installs_is_what_rosdep_installs() -> None:
     by_rosdep = {IMPORT_OF_KEY[key] for key in keys if key in IMPORT_OF_KEY}
     module = {'pyyaml': 'yaml', 'opencv-python-headless': 'cv2'}
     found = requirements_of_setup()
-    words = [re.split(r'[\[<>=; ]', word)[0].lower() for word in [*found[''], *found['cli']]]
+    words = [re.split(r'[\[<>=; ]', word)[0].lower() for word in found['']]
     by_pip = {module.get(word, word) for word in words}
     assert by_rosdep == by_pip - OF_EXTRAS
     assert {'rviz2', 'ros2launch', 'rosbag2_storage_mcap', 'launch_ros'} <= keys
+
+
+def test_the_extra_that_a_message_names_has_the_package_and_the_wheel_has_the_others() -> None:
+    packages = {'rerun': 'rerun-sdk', 'rclpy': 'ros-jazzy-rclpy'}
+    found = {
+        extra: {re.split(r'[\[<>=;]', word)[0].lower() for word in words}
+        for extra, words in requirements_of_setup().items()
+    }
+    for package, extra in EXTRAS.items():
+        assert packages.get(package, package) in found[extra], package
+    assert OF_EXTRAS - EXTRAS.keys() <= found['']
+
+
+def test_the_changelog_has_this_release_first_and_short_entries() -> None:
+    text = (REPOSITORY / 'CHANGELOG.md').read_text()
+    assert re.findall(r'^## \[(\d.*?)\]', text, re.MULTILINE)[0] == __version__
+    entries = [line for line in text.splitlines() if line.startswith('- ')]
+    assert [entry for entry in entries if len(entry[2:].split()) > 25] == []
+    assert not re.search(r'^ ', text, re.MULTILINE)  # an entry is one line
+
+
+def test_no_page_and_no_description_has_a_placeholder() -> None:
+    known = subprocess.run(
+        ['git', 'ls-files', '*.md', '*.xml', '*.cff', '*.py', '*.yml', '*.toml', ':!test/*'],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+    ).stdout.split()
+    words = ('example.' + 'org', 'URL_OF_' + 'THIS')
+    for name in known:
+        text = (REPOSITORY / name).read_text()
+        assert [word for word in words if word in text] == [], name
 
 
 def test_without_its_libraries_the_command_ends_with_one_line(tmp_path) -> None:

@@ -1,18 +1,33 @@
 """The scenes of the published evaluation, rendered, mapped and scored here, beside the published
 figures: `python -m tools.benchmark_published`.
+
+Each is mapped by default, and as published: by the same drive. `--rtabmap rtabgrid` also runs a
+runner of RTAB-Map over it, `rtabgrid slam DIR --out PATH.txt` and `rtabgrid grid DIR --out MAP …`.
+The drives of the second published work are compared by their paths (`published_paths`).
+
+`--keep` writes docs/published.json, from which `python -m tools.figures write` makes the table of
+docs/benchmarks.md.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import datetime
+import json
+import os
+import re
+import subprocess
 import tempfile
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import cv2
+import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.table import Table
 
 from segfloor_ros import __version__
@@ -21,22 +36,28 @@ from segfloor_ros.apps.cli.main import run_command
 from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.apps.cli.terminal import Announce, announcing, figure_table
 from segfloor_ros.apps.evaluation.map_score import (
-    MapScore,
     RoadMapPlan,
     RoadMapScore,
     compare,
     overlay_png,
     score_map,
 )
-from segfloor_ros.apps.evaluation.maps import load_truth
+from segfloor_ros.apps.evaluation.maps import MapTruth, load_truth
+from segfloor_ros.apps.evaluation.trajectory import match, match_files, score_trajectory
+from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.simulation.scene import Scene
 from segfloor_ros.apps.simulation.scene_file import open_scene
-from segfloor_ros.apps.simulation.simulation import render_once
+from segfloor_ros.apps.simulation.simulation import RecordingOptions, render_once
 from segfloor_ros.core.configuration import Configuration
-from segfloor_ros.core.errors import MapError
-from segfloor_ros.core.grid.occupancy import OccupancyGrid, OccupancyGridSettings
+from segfloor_ros.core.contracts import KeyframePath
+from segfloor_ros.core.errors import MapError, SegfloorError
+from segfloor_ros.core.files.whole import read_json
+from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, OccupancyGrid, OccupancyGridSettings
 from segfloor_ros.nodes.configuration import resolve
 from segfloor_ros.nodes.map_files import save_map
+from segfloor_ros.nodes.yaml_files import read_yaml
+from tools import published_paths
 from tools.benchmark_stages import (
     JSON_VERSION,
     MeasuredStages,
@@ -49,25 +70,60 @@ from tools.benchmark_stages import (
 )
 from tools.driving import drive, open_recording
 from tools.published_figures import (
+    HEADS,
     PUBLISHED,
+    RATE_HZ,
+    RAYS,
     SOURCE,
-    PublishedFigures,
-    PublishedScene,
+    Row,
+    cells_of,
     parse_scenes,
 )
+from tools.published_paths import PathRow
+
+SCENES = (*PUBLISHED, *published_paths.DRIVES)
+KEPT = Path(__file__).resolve().parents[1] / 'docs' / 'published.json'
+
+DEFAULT, AS_PUBLISHED = 'segfloor_ros', 'segfloor_ros, as published'
+MODES: dict[str, tuple[str, ...]] = {
+    DEFAULT: (),
+    AS_PUBLISHED: (
+        'occupancy_grid.as_published=true',
+        'cloud_labelling.robot_height_m=10',
+        'stereo_slam.keyframe_novelty=0.3',
+        'stereo_slam.num_features=3000',
+    ),
+}
+"""Assignments by name. As published: points alone, no height limit, a keyframe wherever the
+published conditions ask for one, and as many features as fit the floor."""
+
+RTABMAP_CELL_M = 0.05
+SPECK_CELLS = 3
+"""Side of the square by which maps are opened; what fits into it is a speck."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneResult:
-    """A scene mapped here: what it cost, how good the map is, what was published, and the side of
-    a cell.
+    """A scene mapped here: its row, what it cost, and the score of the map on the floor that the
+    drive could see, as the map is and after an opening.
     """
 
-    scene: str
+    row: Row
     workload: Workload
-    score: MapScore
-    published: PublishedScene
-    cell_m: float
+    raw: RoadMapScore
+    opened: RoadMapScore
+
+
+def published_scene(name: str, changes: Sequence[str] = ()) -> Scene:
+    """Return the scene as it is driven for these figures: at the published rate, as slowly as it
+    takes for about as many keyframes.
+    """
+    published = PUBLISHED[name]
+    given = [f'camera.rate_hz={RATE_HZ:g}', f'resolution_m={published.cell_m:g}']
+    if published.waypoints:
+        given.append(f'path.waypoints={[list(point) for point in published.waypoints]}')
+        given.append(f'path.speed_m_s={published.speed_m_s:g}')
+    return open_scene(name, [*given, *changes])
 
 
 def run_scene(
@@ -77,9 +133,10 @@ def run_scene(
     configuration: Configuration,
     threads: int,
     announce: Announce,
+    system: str = DEFAULT,
 ) -> SceneResult:
     """Render a scene into `folder` unless it is there, map it in a process of its own, score the
-    map, and leave map.yaml and overlay.png in the folder.
+    map, and leave map and overlay in the folder, under the name of the system.
 
     The cells of truth and map are of the same size, so that their rasters do not blur the score:
     of the size set for the map where that is not the default, else as in the published maps.
@@ -93,18 +150,31 @@ def run_scene(
     configuration = with_cells(configuration, cell_m)
     scene = dataclasses.replace(scene, resolution_m=cell_m)
     recording = folder / 'recording'
-    render_once(scene, recording, on_start=lambda count: announce(f'rendering {name}', count))
+    render_once(
+        scene,
+        recording,
+        RecordingOptions(floor_every=0),
+        on_start=lambda count: announce(f'rendering {name}', count),
+    )
     frames = open_recording(recording, configuration).frame_count
     report = announce(f'mapping {name}', frames or 0)
-    workload, grid = run_in_process(
+    workload, grid, path, cpu_s = run_in_process(
         map_recording, name, recording, configuration, threads, on_progress=report
     )
     truth = load_truth(recording)
-    pose = truth.start
-    save_map(grid, folder / 'map.yaml')
-    (folder / 'overlay.png').write_bytes(overlay_png(compare(grid, truth, pose)))
-    score = score_map(grid, truth, pose, RoadMapPlan(nodes=published.nodes))
-    return SceneResult(name, workload, score, published, cell_m)
+    stem = 'map' if system == DEFAULT else 'map_as_published'
+    row, raw, opened = scored_row(grid, truth, name, system, folder / stem)
+    row = dataclasses.replace(
+        row,
+        keyframes=len(path.stamp_ns),
+        update_s=workload.update_s['mean'],
+        update_max_s=workload.update_s['max'],
+        update_mb=workload.memory_mb['slope_per_update'],
+        path_error_m=keyframes_error_m(path, recording),
+        cpu_s=cpu_s,
+        peak_mb=workload.memory_mb['peak'],
+    )
+    return SceneResult(row, workload, raw, opened)
 
 
 def with_cells(configuration: Configuration, cell_m: float) -> Configuration:
@@ -113,10 +183,55 @@ def with_cells(configuration: Configuration, cell_m: float) -> Configuration:
     return dataclasses.replace(configuration, occupancy_grid=grid)
 
 
+def scored_row(
+    grid: OccupancyGrid, truth: MapTruth, name: str, system: str, stem: Path
+) -> tuple[Row, RoadMapScore, RoadMapScore]:
+    """Return the row of a map, and its scores on the floor that the drive could see, as it is and
+    opened; write the map and its overlay. As published, specks within free floor are removed first.
+    """
+    save_map(grid, stem.with_suffix('.yaml'))
+    grid = without_specks(grid)
+    overlay = overlay_png(compare(grid, truth, truth.start))
+    stem.with_name(f'{stem.name}_overlay.png').write_bytes(overlay)
+    plan = RoadMapPlan(nodes=PUBLISHED[name].nodes)
+    seen = score_map(grid, truth, truth.start, plan)
+    everywhere = score_map(
+        grid, dataclasses.replace(truth, base_poses=None), truth.start, plan
+    ).opened
+    row = Row(
+        name,
+        system,
+        cell_m=grid.resolution_m,
+        precision_percent=100 * seen.opened.precision.mean,
+        recall_seen_percent=100 * seen.opened.recall.mean,
+        recall_all_percent=100 * everywhere.recall.mean,
+    )
+    return row, seen.raw, seen.opened
+
+
+def without_specks(grid: OccupancyGrid) -> OccupancyGrid:
+    """Return a map whose isolated occupied cells, those within free ones that an erosion removes,
+    are free (§7.4, p. 107).
+    """
+    cells = grid.cells.copy()
+    others = (grid.states != FREE).astype(np.uint8)
+    count, label, stats, _ = cv2.connectedComponentsWithStats(others, connectivity=8)
+    size = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
+    speck = (size <= SPECK_CELLS).all(axis=1)
+    speck &= np.bincount(label.ravel(), (grid.states == OCCUPIED).ravel(), count) > 0
+    edge: NDArray[np.int32] = np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]])
+    speck[edge] = False
+    speck[0] = False
+    cells[speck[label]] = FREE
+    return dataclasses.replace(grid, cells=cells)
+
+
 def map_recording(
     name: str, recording: Path, configuration: Configuration, threads: int, on_progress: Progress
-) -> tuple[Workload, OccupancyGrid]:
-    """Run all stages over a recording and return what it cost and the map."""
+) -> tuple[Workload, OccupancyGrid, KeyframePath, float]:
+    """Run all stages over a recording; return what it cost, the map, the path of the keyframes and
+    the CPU time in seconds.
+    """
     cv2.setNumThreads(threads)
     source = open_recording(recording, configuration)
     stages = MeasuredStages(source.camera, configuration)
@@ -124,64 +239,153 @@ def map_recording(
         deque(drive(stages, source.frames(), on_progress), maxlen=0)
     if stages.grid is None:
         raise MapError(f'{name}: no map came of {stages.frames} frames')
-    return stages.workload(name), stages.grid
+    usage = os.times()
+    return stages.workload(name), stages.grid, stages.stages.path, usage.user + usage.system
 
 
-def as_document(results: list[SceneResult]) -> dict[str, Any]:
+def keyframes_error_m(path: KeyframePath, recording: Path) -> float:
+    """Return the RMSE of the keyframes' bases after a rigid alignment with the true ones."""
+    times_s, x, y, yaw = np.loadtxt(recording / 'base_poses.txt').T
+    poses: Array = np.tile(np.eye(4), (len(times_s), 1, 1))
+    poses[:, 0, 0], poses[:, 0, 1] = np.cos(yaw), -np.sin(yaw)
+    poses[:, 1, 0], poses[:, 1, 1] = np.sin(yaw), np.cos(yaw)
+    poses[:, 0, 3], poses[:, 1, 3] = x, y
+    estimated = (path.stamp_ns / 1e9, path.T_map_base)
+    return score_trajectory(match(estimated, (times_s, poses), len(times_s))).ate_rmse_m
+
+
+def run_rtabmap(program: Path, name: str, folder: Path, announce: Announce) -> Row:
+    """Return the row of RTAB-Map on a scene that is rendered: with its own path, one update of the
+    map a second, ray tracing, rays as long as published. Raises SegfloorError where it fails.
+
+    Without ray tracing the runner's maps have next to no floor, by its normals as well as by its
+    height; that is not measured, as it may be the runner's fault.
+    """
+    recording, truth = folder / 'recording', load_truth(folder / 'recording')
+    facts = read_yaml(recording / 'scene.yaml', 'names and values')
+    announce(f'RTAB-Map on {name}', 0)
+    path, stem = folder / 'rtabmap.txt', folder / 'rtabmap'
+    said, cpu_s, peak_mb = _run([program, 'slam', recording, '--out', path])
+    nodes = int(_figure(said, 'slam_nodes'))
+    words: list[str | Path | float] = [program, 'grid', recording, '--out', stem, '--tum', path]
+    words += ['--step', round(float(facts['rate_hz'])), '--height', facts['camera_height_m']]
+    words += ['--pitch', float(np.degrees(facts['camera_pitch_rad']))]
+    words += ['--param', f'Grid/CellSize={RTABMAP_CELL_M}', '--param', 'Grid/RayTracing=true']
+    if PUBLISHED[name].range_m:
+        words += ['--param', f'Grid/RangeMax={PUBLISHED[name].range_m:g}']
+    said, _, _ = _run(words)
+    grid = load_map(stem.with_suffix('.yaml'))
+    row, _, _ = scored_row(grid, truth, name, RAYS, folder / 'rtabmap_scored')
+    return dataclasses.replace(
+        row,
+        keyframes=nodes,
+        update_s=(_figure(said, 'median_ms') + _figure(said, 'assemble_median_ms')) / 1000,
+        path_error_m=score_trajectory(match_files(path, recording / 'poses.txt')).ate_rmse_m,
+        cpu_s=cpu_s,
+        peak_mb=peak_mb,
+    )
+
+
+def _run(words: Sequence[str | Path | float]) -> tuple[str, float, float]:
+    """Return what a program said, its CPU time in seconds and its peak memory in MB."""
+    with subprocess.Popen(
+        [str(word) for word in words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        assert process.stdout is not None
+        said = process.stdout.read()
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SegfloorError(f'{words[0]} {words[1]}: status {process.returncode}: {said[-300:]}')
+    return said, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024
+
+
+def _figure(said: str, name: str) -> float:
+    found = re.search(rf'\b{name} ([-\d.]+)', said)
+    if found is None:
+        raise SegfloorError(f'RTAB-Map did not say {name}: {said[-300:]}')
+    return float(found[1])
+
+
+def as_document(
+    results: Sequence[SceneResult], rows: Sequence[Row], paths: Sequence[PathRow] = ()
+) -> dict[str, Any]:
     """Return the figures of all scenes as plain numbers for a JSON file."""
     return {
         'version': JSON_VERSION,
         'segfloor_ros': __version__,
+        'date': datetime.date.today().isoformat(),
         'machine': machine(),
         'published_source': SOURCE,
-        'scenes': [dataclasses.asdict(result) for result in results],
+        'rows': [dataclasses.asdict(row) for row in rows],
+        'published': [
+            dataclasses.asdict(row) for scene in PUBLISHED.values() for row in scene.rows
+        ],
+        'paths': [dataclasses.asdict(row) for row in paths],
+        'workloads': [dataclasses.asdict(result.workload) for result in results],
     }
 
 
-def published_table(results: list[SceneResult]) -> Table:
-    """Return the scores of this run and the published ones side by side."""
-    table = figure_table('figures', 'precision %', 'recall %', 's/update', 'MB/update')
-    for result in results:
-        workload, score = result.workload, result.score
-        costs = (
-            f'{workload.update_s["mean"]:.3f}',
-            f'{workload.memory_mb["slope_per_update"]:.3f}',
-        )
-        cell_cm = 100 * result.cell_m
-        table.add_row(f'[bold]{result.scene}, {score.area_m2:.1f} m², {cell_cm:g} cm')
-        table.add_row('  here, after opening', *_percent(score.opened), *costs)
-        table.add_row('  here, raw', *_percent(score.raw))
-        for figures in result.published.figures:
-            table.add_row(f'  {figures.method} *', *_published_cells(figures))
+def keep(rows: Sequence[Row], paths: Sequence[PathRow], about: str) -> None:
+    """Put rows into docs/published.json, in place of those of the same scenes and systems. about:
+    where and when they were measured.
+    """
+    kept = read_json(KEPT, 'figures') if KEPT.is_file() else {'rows': [], 'paths': []}
+    document: dict[str, Any] = {'about': about}
+    for kind, keys, new in (
+        ('rows', ('scene', 'system'), rows),
+        ('paths', ('drive', 'system'), paths),
+    ):
+        found = [*kept[kind], *map(_rounded, new)]
+        document[kind] = [*{tuple(one[key] for key in keys): one for one in found}.values()]
+    KEPT.write_text(json.dumps(document, indent=1) + '\n', encoding='utf-8')
+
+
+def _rounded(row: Row | PathRow) -> dict[str, Any]:
+    values: dict[str, Any] = dataclasses.asdict(row)
+    return {k: round(v, 4) if isinstance(v, float) else v for k, v in values.items()}
+
+
+def published_table(rows: Sequence[Row]) -> Table:
+    """Return the rows measured here above the published ones, scene by scene."""
+    table = figure_table(*HEADS)
+    for name in dict.fromkeys(row.scene for row in rows):
+        table.add_row(f'[bold]{name}')
+        own = [row for row in rows if row.scene == name]
+        for row in (*own, *PUBLISHED[name].rows):
+            table.add_row(f'  {row.system}', *cells_of(row))
         table.add_section()
     table.caption = (
-        f'precision and recall of road maps; * {SOURCE}: times and memory are means '
-        'over all scenes; here: scenes rendered after its descriptions, floor the drive could see'
+        f'precision and recall of road maps after an opening, without specks; published: {SOURCE}; '
+        'here: scenes rendered after its descriptions'
     )
     return table
 
 
-def _published_cells(figures: PublishedFigures) -> tuple[str, ...]:
-    return (
-        f'{figures.precision_percent:.2f}',
-        f'{figures.recall_percent:.2f}',
-        f'{figures.update_s:.3f}',
-        f'{figures.update_mb:.3f}',
-    )
-
-
-def _percent(score: RoadMapScore) -> tuple[str, str]:
-    return f'{100 * score.precision.mean:.2f}', f'{100 * score.recall.mean:.2f}'
+def path_table(rows: Sequence[PathRow]) -> Table:
+    """Return the paths measured here above the published ones."""
+    table = figure_table(*published_paths.HEADS)
+    for row in published_paths.all_rows(rows):
+        table.add_row(*published_paths.words_of(row))
+    table.caption = f'published: {published_paths.SOURCE}; see tools/published_paths.py'
+    return table
 
 
 def benchmark_published(
-    scenes: Annotated[str, typer.Option(help='Which of the published scenes.')] = ','.join(
-        PUBLISHED
-    ),
+    scenes: Annotated[
+        str, typer.Option(help='Which of the published scenes and drives.')
+    ] = ','.join(SCENES),
     workdir: Annotated[
         Optional[Path],  # noqa: UP045  typer evaluates it, also on Python 3.10
         typer.Option(help='Keep renderings, maps and overlays here; what is there is used again.'),
     ] = None,
+    rtabmap: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(metavar='RTABGRID', help='Runner of RTAB-Map, to map the same drives.'),
+    ] = None,
+    is_kept: Annotated[
+        bool, typer.Option('--keep', help='Write docs/published.json, for docs/benchmarks.md.')
+    ] = False,
     threads: Annotated[
         int, typer.Option(min=1, help='Threads of OpenCV; one compares machines best.')
     ] = 1,
@@ -190,20 +394,38 @@ def benchmark_published(
     assignments: options.Set = None,
 ) -> None:
     """Simulate, map and score the scenes of the published evaluation."""
-    configuration, names = resolve(params, assignments or ()), parse_scenes(scenes)
+    names, rows, paths = parse_scenes(scenes, SCENES), [], []
+    results: list[SceneResult] = []
     with tempfile.TemporaryDirectory(prefix='segfloor-') as temporary, announcing() as announce:
-        folder = workdir or Path(temporary)
-        results = [
-            run_scene(name, open_scene(name), folder / name, configuration, threads, announce)
-            for name in names
-        ]
-    console.print(stage_table([result.workload for result in results]))
-    console.print(workload_table([result.workload for result in results]))
-    console.print(published_table(results))
+        base = workdir or Path(temporary)
+        for name in (name for name in names if name in published_paths.DRIVES):
+            paths += published_paths.run_drive(name, base / name, announce)
+        for name in (name for name in names if name in PUBLISHED):
+            scene, folder = published_scene(name), base / name
+            for system, own in MODES.items():
+                given = [*own, *(assignments or ())]
+                if system == AS_PUBLISHED and PUBLISHED[name].range_m:
+                    given.insert(0, f'occupancy_grid.max_range_m={PUBLISHED[name].range_m:g}')
+                configuration = resolve(params, given)
+                result = run_scene(name, scene, folder, configuration, threads, announce, system)
+                results.append(result)
+                rows.append(result.row)
+            if rtabmap is not None:
+                rows.append(run_rtabmap(rtabmap, name, folder, announce))
+    if rows:
+        console.print(stage_table([result.workload for result in results]))
+        console.print(workload_table([result.workload for result in results]))
+        console.print(published_table(rows))
+    if paths:
+        console.print(path_table(paths))
     if workdir is not None:
-        console.print(f'maps on the truth: {workdir}/*/overlay.png', highlight=False)
+        console.print(f'maps on the truth: {workdir}/*/*_overlay.png', highlight=False)
+    if is_kept:
+        here = machine()
+        today = datetime.date.today().isoformat()
+        keep(rows, paths, f'{today}, {here["processor"]}, Python {here["python"]}')
     if as_json:
-        options.print_json(as_document(results))
+        options.print_json(as_document(results, rows, paths))
 
 
 if __name__ == '__main__':

@@ -4,11 +4,9 @@ Over drives with a known path, poses and covariances are taken as SLAM publishes
 corrections. The motion over a window of time is held against the true one. Its error is a twist e,
 and e^T C^-1 e is a chi-square of 6 degrees of freedom where the covariance C is true.
 
-What is published is the covariance P of each pose, not that of a motion. It is read in two ways;
-twists are those of the camera after the window, and A is the adjoint of the motion back:
-
-    ends     C = A P_a A^T + P_b: the poses before and after err independently
-    later    C = P_b: the pose before is taken for exact
+C = A P_a A^T + P_b + D, of twists of the camera after the window, where A is the adjoint of the
+motion back, P the covariance of each pose in the map around it, and D that of the drift of `odom`
+in between.
 
 The truth errs itself: C has its covariance, too, once for each end. Windows begin at every frame,
 so they overlap; those in which a frame is lost are left out.
@@ -57,7 +55,6 @@ SCENES = 'corridor1', 'corridor2', 'ramp', 'rolling'
 DEPTH_M = 5.0
 """Range of the depth sensor of rendered drives: disparities with noise, over 5 cm."""
 
-READINGS = 'ends', 'later'
 LIMITS = {sigmas: float(chi2.isf(2 * norm.sf(sigmas), 6)) for sigmas in (3, 6)}
 """Of e^T C^-1 e: as improbable as 3 and 6 standard deviations of one figure, 20.1 and 51.9."""
 
@@ -81,14 +78,13 @@ TRUTH_SIGMA: dict[str, tuple[float, float]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One drive, window and reading. beyond_3, beyond_6: share of the windows that err by more than
+    """One drive and window. beyond_3, beyond_6: share of the windows that err by more than
     so many sigma. translation, rotation: median of the normalised squared errors per degree of
     freedom. error_m, error_deg: medians of the errors; sigma_m, sigma_deg: of what is claimed.
     """
 
     drive: str
     window_s: float
-    reading: str
     windows: int
     beyond_3: float
     beyond_6: float
@@ -100,20 +96,21 @@ class Row:
     sigma_deg: float
 
     @property
-    def key(self) -> tuple[str, float, str]:
+    def key(self) -> tuple[str, float]:
         """What tells a row from the others."""
-        return self.drive, self.window_s, self.reading
+        return self.drive, self.window_s
 
 
 @dataclasses.dataclass(frozen=True)
 class Published:
     """Poses of the camera T_odom_left (N, 4, 4), NaN where lost, and the covariance (N, 6, 6) of a
-    twist that is multiplied from the right, in the axes of the camera.
+    twist that is multiplied from the right, in the axes of the camera. drift: (N, 6, 10), of odom.
     """
 
     stamp_ns: Array
     T_odom_left: Array
     covariance: Array
+    drift: Array
 
 
 def consistency(
@@ -127,6 +124,14 @@ def consistency(
     seed: Annotated[int, typer.Option(help='Of the rendered drives.')] = 1,
     exact_truth: Annotated[
         bool, typer.Option('--exact-truth', help='Take the truth of recordings for exact.')
+    ] = False,
+    exact_camera: Annotated[
+        bool,
+        typer.Option(
+            '--exact-camera',
+            help='Take the calibration for exact, as that of rendered drives is: errors of it have '
+            'no part in the drift.',
+        ),
     ] = False,
     assignments: Annotated[
         Optional[list[str]],  # noqa: UP045
@@ -146,14 +151,14 @@ def consistency(
         typer.Option(help='Figures of an earlier --json: they stand before the arrows.'),
     ] = None,
 ) -> None:
-    """Print a row for each drive and window, and for each reading of the covariance."""
+    """Print a row for each drive and window."""
     before = read_rows(compare) if compare else {}
     configuration, start_s = resolve(None, assignments or ()), time.perf_counter()
     rows: list[Row] = []
     with announcing() as announce:
         for name in recordings or (*RECORDINGS, *SCENES):
             for recorded in drives(name, data, cache, seed, limit, announce):
-                rows += measure(recorded, configuration, exact_truth, announce)
+                rows += measure(recorded, configuration, exact_truth, exact_camera, announce)
                 if json_file:
                     document = {'rows': [dataclasses.asdict(row) for row in rows]}
                     json_file.write_text(json.dumps(document, indent=1))
@@ -182,7 +187,11 @@ def drives(
 
 
 def measure(
-    recorded: Recorded, configuration: Configuration, exact_truth: bool, announce: Announce
+    recorded: Recorded,
+    configuration: Configuration,
+    exact_truth: bool,
+    exact_camera: bool,
+    announce: Announce,
 ) -> list[Row]:
     """Drive a recording and return its rows. Raises InputError where its truth is not known."""
     frames = recorded.frames()
@@ -195,19 +204,18 @@ def measure(
     )
     sigma_m, sigma_deg = TRUTH_SIGMA.get(recorded.path.name, (0.0, 0.0))
     noise = np.repeat((sigma_m, math.radians(sigma_deg)), 3) ** 2 * (not exact_truth)
-    published = as_published(tracked.results, tracked.mount)
+    published = as_published(tracked.results, tracked.drift, tracked.mount)
     rows = []
     for window_s in WINDOWS_S:
         pairs = windows(published, window_s)
-        for reading in READINGS if len(pairs) else ():
-            e, C = errors(published, true, pairs, reading, np.diag(noise))
-            if len(e):
-                rows.append(summary(recorded.name, window_s, reading, e, C))
+        if len(pairs):
+            e, C = errors(published, true, pairs, np.diag(noise), exact_camera)
+            rows += [summary(recorded.name, window_s, e, C)] if len(e) else []
     return rows
 
 
-def as_published(results: Sequence[FrameResult], mount: Mount) -> Published:
-    """Return poses and covariances of the camera from those of the base.
+def as_published(results: Sequence[FrameResult], drift: Array, mount: Mount) -> Published:
+    """Return poses and covariances of the camera from those of the base. drift: (N, 6, 10).
 
     The covariance of the base has the axes of `odom` at the base: turned to those of the base it is
     that of a twist from the right, and the adjoint of the mount brings it to the camera.
@@ -219,7 +227,7 @@ def as_published(results: Sequence[FrameResult], mount: Mount) -> Published:
     B = adjoint(invert(mount.T_base_left)) @ turns
     P = np.array([result.covariance for result in results])
     stamps = np.array([result.stamp_ns for result in results])
-    return Published(stamps, T_odom_base @ mount.T_base_left, B @ P @ np.swapaxes(B, 1, 2))
+    return Published(stamps, T_odom_base @ mount.T_base_left, B @ P @ np.swapaxes(B, 1, 2), drift)
 
 
 def windows(published: Published, window_s: float) -> Array:
@@ -238,11 +246,11 @@ def windows(published: Published, window_s: float) -> Array:
 
 
 def errors(
-    published: Published, true: Array, pairs: Array, reading: str, truth_noise: Array
+    published: Published, true: Array, pairs: Array, truth_noise: Array, exact_camera: bool = False
 ) -> tuple[Array, Array]:
     """Return the errors (M, 6) of motions as twists of the later camera, and the covariance (M, 6,
     6) that is claimed for them; without those whose true motion is not known. true: (N, 4, 4).
-    truth_noise: (6, 6), of each true pose.
+    truth_noise: (6, 6), of each true pose. exact_camera: whether the calibration does not err.
     """
     a, b = pairs.T
     known = np.isfinite(true[a, 0, 0] + true[b, 0, 0])
@@ -251,10 +259,14 @@ def errors(
     e = se3_logs(invert(invert(true[a]) @ true[b]) @ T_a_b)
     A = adjoint(invert(T_a_b))
     At = np.swapaxes(A, 1, 2)
-    C = published.covariance[b] + A @ truth_noise @ At + truth_noise + LEAST * np.eye(6)
-    if reading == 'ends':
-        C = C + A @ published.covariance[a] @ At
-    return e, C
+    C = A @ (published.covariance[a] + truth_noise) @ At + published.covariance[b] + truth_noise
+    drift = published.drift[b] - published.drift[a]
+    drift[:, :, 6:] *= not exact_camera
+    # Twists before a pose, as those behind it.
+    drift = adjoint(invert(published.T_odom_left[b])) @ drift
+    steps, calibration = np.split(drift, [6], axis=2)
+    C = C + steps @ np.swapaxes(adjoint(invert(published.T_odom_left[b])), 1, 2)
+    return e, C + calibration @ np.swapaxes(calibration, 1, 2) + LEAST * np.eye(6)
 
 
 def normalised(e: Array, C: Array) -> Array:
@@ -262,7 +274,7 @@ def normalised(e: Array, C: Array) -> Array:
     return np.asarray(np.einsum('mi,mi->m', e, np.linalg.solve(C, e[:, :, None])[:, :, 0]))
 
 
-def summary(drive: str, window_s: float, reading: str, e: Array, C: Array) -> Row:
+def summary(drive: str, window_s: float, e: Array, C: Array) -> Row:
     """Return the row of errors (M, 6) with their covariances (M, 6, 6)."""
     squared = normalised(e, C)
     sigmas = np.sqrt([np.trace(C[:, :3, :3], axis1=1, axis2=2),
@@ -277,25 +289,25 @@ def summary(drive: str, window_s: float, reading: str, e: Array, C: Array) -> Ro
         np.degrees(np.median(np.linalg.norm(e[:, 3:], axis=1))),
         np.degrees(np.median(sigmas[1])),
     )
-    return Row(drive, window_s, reading, len(e), *(round(float(value), 6) for value in figures))
+    return Row(drive, window_s, len(e), *(round(float(value), 6) for value in figures))
 
 
-def read_rows(file: Path) -> dict[tuple[str, float, str], Row]:
+def read_rows(file: Path) -> dict[tuple[str, float], Row]:
     """Return the rows of a file of --json."""
     rows = [Row(**fields) for fields in read_json(file, 'figures of tools.consistency')['rows']]
     return {row.key: row for row in rows}
 
 
-def table_of(rows: Sequence[Row], before: dict[tuple[str, float, str], Row]) -> Table:
+def table_of(rows: Sequence[Row], before: dict[tuple[str, float], Row]) -> Table:
     """Return a line for each row; figures of before stand before arrows."""
     heads = (
         'windows', '> 3 σ %', '> 6 σ %', 'translation', 'rotation', 'error mm', 'σ mm', 'error °',
         'σ °',
     )  # fmt: skip
-    table = figure_table('drive, window, reading', *heads)
+    table = figure_table('drive, window', *heads)
     for row in rows:
         then = _figures(before[row.key]) if row.key in before else [''] * len(heads)
-        name = f'{row.drive}, {row.window_s:g} s, {row.reading}'
+        name = f'{row.drive}, {row.window_s:g} s'
         table.add_row(name, *map(arrow, then, _figures(row)))
     table.caption = (
         'of true covariances 0.27 % of the windows are beyond 3 σ and none beyond 6; translation, '

@@ -2,13 +2,13 @@
 
 `python -m tools.figures measure DATA WORK` renders the drives, maps all of them and the recordings
 in DATA, and writes docs/figures.json; what is there already is used again. `python -m tools.figures
-write` puts its figures between the marks of the two pages.
+write` puts its figures, and those of docs/published.json (`tools.benchmark_published`), between the
+marks of the two pages.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,9 +32,12 @@ from segfloor_ros.apps.suite.measures import measure_run, start_pose_of
 from segfloor_ros.apps.trajectory import read_trajectory
 from segfloor_ros.core.files.whole import read_json
 from segfloor_ros.core.geometry import Array
+from tools.published_figures import Row, page_table
+from tools.published_paths import PathRow, paths_table
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / 'docs' / 'figures.json'
+PUBLISHED_FIGURES = ROOT / 'docs' / 'published.json'
 PAGES = (ROOT / 'README.md', ROOT / 'docs' / 'benchmarks.md')
 OUTLINES = ROOT / 'test' / 'core' / 'floor'
 TIMEOUT_S = 3600.0
@@ -126,7 +129,13 @@ def write() -> None:
 def written(page: str) -> str:
     """Return a page with the tables that its marks ask for."""
     figures = read_json(FIGURES, 'figures')
-    for mark, table in {'measured': _short_table, 'drives': _long_table}.items():
+    tables = {
+        'measured': _short_table,
+        'drives': _long_table,
+        'published': _published_table,
+        'paths': _paths_table,
+    }
+    for mark, table in tables.items():
         start, end = f'<!-- {mark}: python -m tools.figures write -->\n', f'<!-- end of {mark} -->'
         if start in page:
             before, _, rest = page.partition(start)
@@ -217,7 +226,7 @@ def _short_table(figures: dict[str, Any]) -> str:
 def _long_table(figures: dict[str, Any]) -> str:
     heads = ('recording', 'what', 'frames, length', 'tracked', 'path error',
              'road map, precision / recall', 'free cells', 'floor masks; false floor',
-             'frames with something that moves', 'camera: height, pitch', 'time')  # fmt: skip
+             'frames with something that moves', 'time')  # fmt: skip
     rows = []
     for name, drive in DRIVES.items():
         found = figures['drives'][name]
@@ -228,10 +237,23 @@ def _long_table(figures: dict[str, Any]) -> str:
             (
                 name, drive.about, f'{found["frames"]:.0f}, {found["length_m"]:.1f} m',
                 _tracked(found), _path(found), _pair(found, ''), _pair(found, 'free'), masks,
-                f'{found["moving_frames"]:.0f}', _mount(found), f'{found["wall_s"]:.0f} s',
+                f'{found["moving_frames"]:.0f}', f'{found["wall_s"]:.0f} s',
             )
         )  # fmt: skip
     return _table(heads, rows)
+
+
+def _published_table(figures: dict[str, Any]) -> str:
+    """Return the figures of docs/published.json; the others are not needed."""
+    found = read_json(PUBLISHED_FIGURES, 'figures')
+    rows = [Row(**row) for row in found['rows']]
+    return f'{page_table(rows)}\nMeasured here: {found["about"]}.\n'
+
+
+def _paths_table(figures: dict[str, Any]) -> str:
+    """Return the paths of docs/published.json; the other figures are not needed."""
+    found = read_json(PUBLISHED_FIGURES, 'figures')
+    return paths_table([PathRow(**row) for row in found['paths']])
 
 
 def _tracked(found: dict[str, float]) -> str:
@@ -244,13 +266,6 @@ def _path(found: dict[str, float]) -> str:
             f'{found["path_error_m"]:.3f} m'
         )  # fmt: skip
     return f'ends {found["end_error_m"]:.2f} m off' if 'end_error_m' in found else '–'
-
-
-def _mount(found: dict[str, float]) -> str:
-    if 'camera_pitch_rad' not in found:
-        return 'not known'
-    pitch_deg = math.degrees(found['camera_pitch_rad'])
-    return f'{found["camera_height_m"]:.3g} m, {pitch_deg:.1f}°'
 
 
 def _pair(found: dict[str, float], kind: str) -> str:

@@ -17,6 +17,7 @@ from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.contracts import FrameResult, KeyframePath, Mount, StereoFrame
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.plugins.assembly import make_slam
+from segfloor_ros.core.slam.drift import DriftMeter
 from segfloor_ros.core.slam.held_results import left_out
 from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE
 from tools.driving import after_sensors, drive
@@ -28,12 +29,14 @@ UNCERTAIN = 'uncertain'
 @dataclasses.dataclass(frozen=True)
 class TrackedFrames:
     """SLAM over N frames. results: of each frame, as it was published last, without keyframes;
-    frames that are in no map at the end are not tracked. T_map_left: (N, 4, 4), the rectified left
-    camera, every frame carried along by its keyframe's final pose; NaN where it is not tracked.
-    seconds: CPU time of the calling thread.
+    frames that are in no map at the end are not tracked. drift: (N, 6, 10), of odom (see
+    `core.slam.drift`). T_map_left: (N, 4, 4), the rectified left camera, every frame carried along
+    by its keyframe's final pose; NaN where it is not tracked. seconds: CPU time of the calling
+    thread.
     """
 
     results: list[FrameResult]
+    drift: Array
     T_map_left: Array
     mount: Mount
     keyframes: int
@@ -72,13 +75,16 @@ def track_frames(
     mount = None if with_mount or settings.has_mount else CAMERA_AS_BASE
     slam = make_slam(camera, settings, mount)
     results: list[FrameResult] = []
+    keyframe_ns: set[int] = set()
     path = KeyframePath(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
     start_s = time.thread_time()
 
     def note(published: Sequence[FrameResult]) -> None:
         nonlocal path
         for result in published:
-            path = result.keyframe.path if result.keyframe is not None else path
+            if result.keyframe is not None:
+                path = result.keyframe.path
+                keyframe_ns.add(result.stamp_ns)
             while results and results[-1].index >= result.index:  # they come once more
                 results.pop()
             results.append(dataclasses.replace(result, keyframe=None, moving=None))
@@ -92,8 +98,14 @@ def track_frames(
     assert slam.mount is not None
     began_ns = path.stamp_ns[0] if len(path.stamp_ns) else 0
     results = [left_out(r) if r.tracked and r.stamp_ns < began_ns else r for r in results]
+    meter, drift = DriftMeter(camera.fx), []
+    meter.T_base_left = slam.mount.T_base_left
+    for result in results:
+        meter.see(result, result.stamp_ns in keyframe_ns)
+        drift.append(meter.drift)
     return TrackedFrames(
         results,
+        np.array(drift),
         _corrected(frames, results, path) @ slam.mount.T_base_left,
         slam.mount,
         len(path.stamp_ns),

@@ -42,6 +42,15 @@ MIN_CORNERS = 6
 """Corners of a board with markers that both eyes must see: four give the pose of a plane, all of
 which is then fitted to their noise."""
 
+COVERED = 0.8
+"""Share of an image that the hull of all corners should have: a margin of 5 % of the width and of
+the height on each side. Beyond the hull the model of the lens is extrapolated.
+"""
+
+CORNER_PX = 0.3
+"""RMS error of the corners of sharp pictures of a flat board; more is blur, motion or a bent board.
+"""
+
 MAX_SCALE_ERROR = 0.01
 """A ruler shows the side of a square to half of this."""
 
@@ -228,6 +237,28 @@ class CalibrationResult:
         corners = np.concatenate([view.corners[side] for view in self.views])
         eye = self.calibration.left
         return cv2.contourArea(cv2.convexHull(corners)) / (eye.width * eye.height)
+
+    @property
+    def advice(self) -> list[str]:
+        """What to do before the calibration is used, each in a line; empty where it is good."""
+        lines = []
+        for side, name in enumerate(('left', 'right')):
+            share = self.seen_share(side)
+            if share < COVERED:
+                lines.append(
+                    f'the board covers {int(100 * share)}% of the {name} image, and beyond that '
+                    'the lens is a guess: add pairs with the board at the borders and in the '
+                    'corners, until '
+                    f'it covers {COVERED:.0%}'
+                )
+        worst_px = max(self.rms_px, self.epipolar_rms_px)
+        if worst_px > CORNER_PX:
+            lines.append(
+                f'the corners err by {worst_px:.2f} px, sharp pictures of a flat board by '
+                f'{CORNER_PX} px at most: look at {self.views[0].paths[0].name}, take out pairs '
+                'that are blurred or show a bent board, and calibrate again'
+            )
+        return lines
 
 
 def calibrate_folder(

@@ -436,6 +436,10 @@ class LockstepRun:
         of_floor = [self._said.get(about, words) for about, words in stages.floor.remarks.items()]
         faults = slam.rig_check.faults
         faults.update({name: self._faults_said.get(name, one) for name, one in faults.items()})
+        planes = np.reshape(stages.floor.fixture.planes, (-1, 3))
+        # Those of a map that was loaded come before all stamps.
+        looks = sum(keyframe.stamp_ns >= 0 for keyframe in slam.map.keyframes)
+        floor = results_folder.floor_heights(planes[:, 2], looks) if has_map else None
         return results_folder.summarise(
             [results_folder.DriveFrame.of(result) for result in self._results],
             wall_s,
@@ -450,6 +454,7 @@ class LockstepRun:
             input_faults=slam.rig_check.as_dicts(),
             failed_frames=self._failed_frames,
             failed_keyframes=pipeline.failed_keyframes,
+            floor=floor,
             interrupted=self._is_cut_short,
             stages=pipeline.times.summary(),
             rss_mb=self._memory.summary(),

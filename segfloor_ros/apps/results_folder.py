@@ -82,9 +82,10 @@ class RunSummary:
     blind_frames: with a pose of wheels or gyroscope alone. moving_frames: in which something was
     found that moves. sensor_remarks: what seems wrong with sensors, in words. input_faults: what is
     wrong with the images: fault, value, unit and remedy. failed_frames, failed_keyframes: at which
-    a stage failed; they are lost or not in the map. interrupted: whether the drive was cut short.
-    stages: by name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start, peak and slope_per_update
-    in MB, and samples over the updates.
+    a stage failed; they are lost or not in the map. floor: how high the camera is above the planes
+    of single keyframes (`floor_heights`), None where that is not known. interrupted: whether the
+    drive was cut short. stages: by name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start, peak
+    and slope_per_update in MB, and samples over the updates.
     """
 
     map: str | None
@@ -112,6 +113,7 @@ class RunSummary:
     input_faults: list[dict[str, Any]]
     failed_frames: int
     failed_keyframes: int
+    floor: dict[str, float] | None
     interrupted: bool
     stages: dict[str, dict[str, float]]
     rss_mb: dict[str, Any]
@@ -429,11 +431,20 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ('keyframes', summary.keyframes),
         ('map updates', summary.map_updates),
         *_mount_rows(summary.camera_height_m, summary.camera_pitch_rad),
+        ('camera height by single keyframes', _floor_words(summary.floor)),
         ('time', f'{summary.wall_s:.1f} s ({summary.frames_per_s:.1f} frames/s)'),
         ('memory, peak', f'{summary.rss_mb["peak"]:.0f} MB'),
-        ('memory per map update', f'{summary.rss_mb["slope_per_update"]:.3f} MB'),
+        ('memory per map update', memory_growth(summary.rss_mb)),
     ]
     return [(what, str(value)) for what, value in rows if value is not None]
+
+
+def memory_growth(rss_mb: Mapping[str, Any]) -> str:
+    """Return by how much the memory grows with each map update, in words; a slope below zero is
+    memory that was freed.
+    """
+    words = f'{max(rss_mb["slope_per_update"], 0):.3f} MB'
+    return 'none' if words == '0.000 MB' else words
 
 
 def _mount_rows(height_m: float | None, pitch_rad: float | None) -> list[tuple[str, str]]:
@@ -443,6 +454,31 @@ def _mount_rows(height_m: float | None, pitch_rad: float | None) -> list[tuple[s
         ('camera height', f'{height_m:.3f} m'),
         ('camera pitch', f'{np.degrees(pitch_rad):.2f} deg'),
     ]
+
+
+def floor_heights(heights_m: NDArray[np.floating], looks: int) -> dict[str, float]:
+    """Return how many keyframes show a plane (`planes`), by the heights (N,) of the camera above
+    these, and of how many of this drive (`looks`). If there are any, also the medians of all
+    (`median_m`), of the first (`first_m`) and of the last third (`last_m`) of the drive.
+    """
+    count = len(heights_m)
+    if not count:
+        return {'planes': 0, 'looks': looks}
+    third = -(-count // 3)
+    parts = {'median_m': heights_m, 'first_m': heights_m[:third], 'last_m': heights_m[-third:]}
+    medians = {name: round(float(np.median(part)), 4) for name, part in parts.items()}
+    return {'planes': count, 'looks': looks, **medians}
+
+
+def _floor_words(floor: Mapping[str, float] | None) -> str | None:
+    if floor is None:
+        return None
+    if not floor['planes']:
+        return 'no keyframe shows the plane of the floor'
+    return (
+        f'{floor["median_m"]:.3f} m ({floor["planes"]} planes; first third '
+        f'{floor["first_m"]:.3f} m, last third {floor["last_m"]:.3f} m)'
+    )
 
 
 def _range_words(submap: Mapping[str, int | bool]) -> str:

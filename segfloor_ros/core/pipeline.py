@@ -33,7 +33,7 @@ from segfloor_ros.core.contracts import (
 )
 from segfloor_ros.core.files.arrays import Arrays
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
-from segfloor_ros.core.grid.mapper import OccupancyGridMapper
+from segfloor_ros.core.grid.mapper import make_mapper
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE, StereoSlam
 from segfloor_ros.core.timing import StageTimes
@@ -101,7 +101,7 @@ class KeyframeStages:
         self._times = times
         self.floor = FloorSegmentation(camera, configuration.floor_segmentation)
         self._labelling = CloudLabelling(configuration.cloud_labelling)
-        self._mapper = OccupancyGridMapper(configuration.occupancy_grid)
+        self._mapper = make_mapper(configuration.occupancy_grid)
 
     def process(self, keyframe: Keyframe, mount: Mount) -> FloorObservation:
         """Take in one keyframe."""

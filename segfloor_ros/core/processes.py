@@ -21,15 +21,15 @@ _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
 
 
-def end_with_parent(parent_id: int) -> None:
-    """Have the kernel send SIGTERM to this process when its parent ends, however it ends (prctl(2),
-    Linux only). For `preexec_fn`, too.
+def end_with_parent(parent_id: int, by: signal.Signals = signal.SIGTERM) -> None:
+    """Have the kernel send a signal to this process when its parent ends, however it ends
+    (prctl(2), Linux only). For `preexec_fn`, too.
     """
     if sys.platform != 'linux':
         return
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    _LIBC.prctl(_PR_SET_PDEATHSIG, by)
     if os.getppid() != parent_id:
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), by)
 
 
 def _begin(work: Callable[..., None], *arguments: Any) -> None:

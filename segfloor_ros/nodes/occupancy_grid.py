@@ -11,7 +11,7 @@ from rclpy.timer import Timer
 from segfloor_ros.core.errors import MapError, SettingsError
 from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.files.paths import user_path
-from segfloor_ros.core.grid.mapper import OccupancyGridMapper
+from segfloor_ros.core.grid.mapper import make_mapper
 from segfloor_ros.nodes.messages.grids import grid_message
 from segfloor_ros.nodes.messages.points import features_arrays, labelled_arrays
 from segfloor_ros.nodes.messages.poses import path_arrays
@@ -43,7 +43,7 @@ class OccupancyGridNode(StageNode[OccupancyGridNodeSettings]):
     def reset_stage(self) -> None:
         """Begin with an empty map."""
         self._part.reset()
-        self._stage = OccupancyGridMapper(self.settings)
+        self._stage = make_mapper(self.settings)
         self._published_s = -float('inf')
 
     def restore(self, saved: MapFile) -> None:

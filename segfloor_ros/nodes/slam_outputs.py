@@ -1,31 +1,22 @@
-"""What the node `stereo_slam` gives: topics about frames and keyframes, reports, and the maps that
-it loads, saves, and keeps for its next life.
-"""
+"""What the node `stereo_slam` gives: topics about frames and keyframes, and reports."""
 
 from __future__ import annotations
 
 import json
 import math
-import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.task import Future
-from std_msgs.msg import UInt8MultiArray
 
 from segfloor_ros.core.camera.calibration import StereoCalibration
 from segfloor_ros.core.camera.pixels import Region, shrink_factor, shrunk_camera, shrunk_image
-from segfloor_ros.core.contracts import FrameResult, Keyframe, LoadedMap, Mount, StereoFrame
-from segfloor_ros.core.errors import MapError, SettingsError
-from segfloor_ros.core.files.arrays import MapFile
-from segfloor_ros.core.files.paths import user_path
+from segfloor_ros.core.contracts import FrameResult, Keyframe, Mount, StereoFrame
 from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.slam.drift import DriftMeter
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.nodes.messages import odometry as odometry_messages
 from segfloor_ros.nodes.messages import points, poses
@@ -33,32 +24,24 @@ from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectif
 from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART, Level
 from segfloor_ros.nodes.messages.images import image_message
 from segfloor_ros.nodes.messages.map_starts import map_start_message
-from segfloor_ros.nodes.messages.saved_maps import map_file_message, map_file_of
 from segfloor_ros.nodes.messages.topics import (
     CORRECTED,
     FRAME_PARTS,
     FRESH_S,
     KEYFRAME_PARTS,
-    MAP_LOADED,
-    MAP_PART,
     MAP_START,
-    MAP_WANTED,
     MOVING_MASK,
-    PATIENCE_S,
     SIDES,
-    make_header,
 )
 from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
-from segfloor_ros.nodes.shared.inputs import LEAST_PERIOD_S, LOOK_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.nodes.slam_camera import Watch
 
 MAPPING_SUBMAP = 'lost; maps a submap until it recognises a place of the map'
 
-PARTS = {'cloud', 'grid'}
-"""What the nodes behind know of a map."""
-
+AT_A_TIME = 2
+"""Results that are published together: more than a frame brings."""
 
 FRAME_NS = 80_000_000
 """Between small images: every third of a camera with 30 Hz, each of one with 10."""
@@ -102,15 +85,18 @@ class SlamTopics:
     def begin(self, calibration: StereoCalibration, frames: CameraFrames) -> None:
         """Publish about this camera from now on. calibration: of the rectified images."""
         self._calibration, self.frames = calibration, frames
+        self._drift = DriftMeter(calibration.camera.fx)
 
     def publish_mount(self, mount: Mount) -> None:
         """Publish where the left camera sits on the base; the stamp tells for which map."""
         base, left = self._own.base_frame, self.frames.left
         message = poses.transform_message(self.map_start_ns, base, left, mount.T_base_left)
         self._out.publish('camera_mount', message)
+        self._drift.T_base_left = mount.T_base_left
 
     def publish(self, result: FrameResult) -> None:
         """Publish a frame's pose, none while there is none, and everything of a keyframe."""
+        self._drift.see(result, result.keyframe is not None)
         if result.tracked and result.stamp_ns != self._announced_ns:
             self._publish_pose(result)
         if result.moving is not None:
@@ -183,8 +169,9 @@ class SlamTopics:
             message = odometry_messages.pose_with_covariance_message(*at, T_map_base, in_map)
             self._out.publish('pose' + suffix, message)
         at, T_odom_base = (result.stamp_ns, own.odom_frame), result.T_odom_base
+        in_odom = odometry_messages.never_certain(self._drift.covariance(result))
         odometry = odometry_messages.odometry_message(
-            *at, own.base_frame, T_odom_base, covariance, twist, of_twist
+            *at, own.base_frame, T_odom_base, in_odom, twist, of_twist
         )
         self._out.publish('odometry' + suffix, odometry)
 
@@ -221,8 +208,8 @@ class SlamTopics:
 
 
 class SlamResults:
-    """Publishes what SLAM has found out about frames, and reports how it went: one by one, since
-    others need time to take each of them.
+    """Publishes what SLAM has found out about frames, and reports how it went: few at a time, since
+    others need time to take each, but more than come, so that none waits behind those held back.
     """
 
     def __init__(self, node: AnyStageNode, transforms: Transforms, watch: Watch) -> None:
@@ -231,7 +218,7 @@ class SlamResults:
         self._transforms = transforms
         self._watch = watch
         self._unsent: deque[tuple[FrameResult, StereoSlam, float]] = deque()
-        node.inputs.repeat(self._send_next)
+        self._send_more = node.inputs.later(self._send_some)
 
     def reset(self, map_start_ns: int, is_loaded: bool = False) -> None:
         """Publish about another map from now on, of a camera whose mount is not known."""
@@ -250,8 +237,7 @@ class SlamResults:
             self.mount = None
             self.topics.begin_map(self.topics.map_start_ns + 1)
         self._unsent.extend((result, slam, milliseconds / len(results)) for result in results)
-        if len(self._unsent) == 1:
-            self._send_next()
+        self._send_some()
 
     def announce(self, result: FrameResult, frame: StereoFrame, moving: Region | None) -> None:
         """Publish pose and images of a keyframe at once, while the map takes it in; its floor is
@@ -276,11 +262,12 @@ class SlamResults:
         reporter.health.waits(words)
         reporter.report(stamp_ns, Level.WARN, words, input_faults=_faults_json(slam))
 
-    def _send_next(self) -> float:
-        """Publish the oldest result that is not yet; return in how many seconds the next is due."""
-        if self._unsent:
+    def _send_some(self) -> None:
+        """Publish the oldest results that are not yet, and have the rest follow."""
+        for _ in range(min(AT_A_TIME, len(self._unsent))):
             self._publish(*self._unsent.popleft())
-        return LEAST_PERIOD_S if self._unsent else LOOK_S
+        if self._unsent:
+            self._send_more()
 
     def _publish(self, result: FrameResult, slam: StereoSlam, milliseconds: float) -> None:
         if self.mount is None and result.tracked and slam.mount is not None:
@@ -360,203 +347,3 @@ class SlamResults:
 
 def _faults_json(slam: StereoSlam) -> str:
     return json.dumps(slam.rig_check.as_dicts())
-
-
-class SlamMaps:
-    """The services `~/save_map`, `~/load_map`, `~/prune_map` and `~/map_info`, and what SLAM and
-    the nodes behind it tell each other about maps of files.
-
-    slam: returns what could be saved, of the map that `topics` are about.
-    """
-
-    def __init__(
-        self, node: AnyStageNode, topics: SlamTopics, slam: Callable[[], StereoSlam | None]
-    ) -> None:
-        self._node = node
-        self._topics = topics
-        self._slam = slam
-        self.loaded: tuple[MapFile, LoadedMap] | None = None
-        """What was read of a file and is still to be announced."""
-        self._kept_ns: int | None = None
-        self._parts: dict[str, MapFile] = {}
-        self._arrived: Future | None = None
-        node.inputs.subscribe(MAP_PART, self._take_part)
-        node.outputs.trigger('~/save_map', self._save)
-        node.outputs.trigger('~/load_map', self._load)
-        node.outputs.trigger('~/prune_map', self._prune)
-        node.outputs.trigger('~/map_info', self._info)
-
-    @property
-    def _own(self) -> StereoSlamNodeSettings:
-        own: StereoSlamNodeSettings = self._node.settings
-        return own
-
-    def read(self) -> MapFile | None:
-        """Return the map of the parameter `load_map`, None where it is empty. Raises InputError."""
-        self.loaded, name = None, self._own.load_map
-        if not name:
-            return None
-        from segfloor_ros.core.files.results import read_map_file
-
-        return read_map_file(user_path(name))
-
-    def keep(self, slam: StereoSlam) -> None:
-        """Keep what a later life of this node goes on from, where there are new keyframes."""
-        last_ns = slam.map.keyframes[-1].stamp_ns
-        if self._node.kept_state.is_due and last_ns != self._kept_ns and not self._own.localize:
-            self._node.kept_state.save(self._slam_part)
-            self._kept_ns = last_ns
-
-    def announce(self) -> None:
-        """Send the nodes behind what they need of a map that was loaded."""
-        if self.loaded is None:
-            return
-        (saved, loaded), self.loaded = self.loaded, None
-        start_ns = self._topics.map_start_ns
-        header = {
-            'start_ns': start_ns,
-            'loaded_ns': start_ns,
-            'last_ns': int(loaded.path.stamp_ns[-1]),
-            'frame_id': self._own.map_frame,
-        }
-        cloud, grid = loaded.cloud, saved.parts['grid']
-        parts = {
-            'cloud': saved.parts['cloud'],
-            'grid': grid | {'stamp_ns': grid['stamp_ns'] + loaded.shift_ns},
-            'points': {'point_id': cloud.point_id, 'xyz_map': cloud.xyz_map},
-        }
-        self._node.outputs.publish(MAP_LOADED, map_file_message(MapFile(header, parts)))
-
-    def _slam_part(self) -> MapFile:
-        slam = self._slam()
-        if slam is None:
-            raise MapError('there is no map yet that could be saved')
-        from segfloor_ros.core.plugins.maps.saved_slam import save_slam
-
-        saved = save_slam(slam, slam.rig.camera)
-        saved.header['start_ns'] = self._topics.map_start_ns
-        return saved
-
-    def _load(self) -> str:
-        if not self._own.load_map:
-            raise SettingsError('load_map is empty; set it to the name of a saved map')
-        self.read()  # one that cannot be read leaves the map as it is
-        self._node.reset('by ~/load_map')
-        return self._own.load_map
-
-    def _info(self) -> str:
-        """Return what the map holds, as JSON."""
-        saved = self._slam_part()
-        slam, sessions = saved.parts['slam'], saved.header['sessions']
-        columns = {
-            'keyframes': 'keyframe_stamp_ns', 'points': 'point_stable_id', 'loops': 'loop_ends',
-        }  # fmt: skip
-        sizes = {name: len(slam[column]) for name, column in columns.items()}
-        return json.dumps(sizes | {'sessions': sessions})
-
-    def _file_to_save(self) -> Path:
-        if not self._own.save_map:
-            raise SettingsError('save_map is empty; set it to the name of a file, e.g. home.map')
-        if self._arrived is not None:
-            raise MapError('a map is being saved already')
-        return user_path(self._own.save_map).absolute()
-
-    async def _prune(self) -> str:
-        """Prune the file of `save_map` beside tracking; the map in use stays as it is."""
-        from segfloor_ros.core.plugins.maps.pruning import prune_file
-
-        said: list[str] = []
-        path = self._file_to_save()
-        await _in_background(lambda: said.append(prune_file(path)))
-        return said[0]
-
-    async def _save(self) -> str:
-        """Gather the map and write it beside tracking, which goes on meanwhile."""
-        return await self._completed(*self._begin_to_save())
-
-    def save_before_reset(self) -> None:
-        """Begin to save a map that is dropped now, where `save_map` names a file."""
-        slam = self._slam()
-        has_map = slam is not None and slam.mount is not None and bool(slam.map.keyframes)
-        if not (self._own.save_map and has_map) or self._own.localize or self._arrived is not None:
-            return
-        node, log_fault = self._node, self._node.reporter.log_fault
-
-        async def complete(path: Path, saved: MapFile) -> None:
-            try:
-                place = await self._completed(path, saved)
-                node.get_logger().warning(f'the map before the reset is in {place}')
-            except Exception as error:
-                log_fault('save_map, before the reset', error)
-
-        try:
-            assert node.executor is not None
-            node.executor.create_task(complete, *self._begin_to_save())
-        except Exception as error:
-            log_fault('save_map, before the reset', error)
-
-    def _begin_to_save(self) -> tuple[Path, MapFile]:
-        """Ask for the parts of the other nodes; returns where to save, and SLAM's own part."""
-        from segfloor_ros.core.files.results import SAVED_MAP
-        from segfloor_ros.core.files.writing import check_output
-
-        path = self._file_to_save()
-        check_output(path, SAVED_MAP, (self._own.load_map,), 'save_map')
-        saved = self._slam_part()
-        self._arrived = Future()
-        last_ns = int(saved.parts['slam']['keyframe_stamp_ns'][-1])
-        self._node.outputs.publish(MAP_WANTED, make_header(last_ns, self._own.map_frame))
-        return path, saved
-
-    async def _completed(self, path: Path, saved: MapFile) -> str:
-        """Save a map once the parts of the other nodes have come; returns where it is."""
-        start_ns, arrived = saved.header.pop('start_ns'), self._arrived
-        assert arrived is not None
-        give_up = self._node.inputs.steady_timer(PATIENCE_S, self._give_up)
-        try:
-            await arrived
-            for part in self._parts.values():
-                if part.header['start_ns'] != start_ns:
-                    raise MapError('the map was reset while it was saved')
-                saved.parts |= part.parts
-            from segfloor_ros.core.files.results import write_map_file
-
-            inputs = (self._own.load_map,)
-            await _in_background(partial(write_map_file, path, saved, inputs))
-        finally:
-            self._node.destroy_timer(give_up)
-            self._arrived, self._parts = None, {}
-        return str(path)
-
-    def _give_up(self) -> None:
-        if self._arrived is not None and not self._arrived.done():
-            missing = ', '.join(sorted(PARTS - self._parts.keys()))
-            text = (
-                f'the map is not saved: within {PATIENCE_S:g} s no answer on {MAP_PART} of the '
-                f'part {missing}; are cloud_labelling and occupancy_grid active?'
-            )
-            self._arrived.set_exception(MapError(text))
-
-    def _take_part(self, message: UInt8MultiArray) -> None:
-        part = map_file_of(message, MAP_PART)
-        if self._arrived is None or self._arrived.done():
-            return
-        self._parts.update(dict.fromkeys(part.parts, part))
-        if self._parts.keys() >= PARTS:
-            self._arrived.set_result(None)
-
-
-async def _in_background(work: Callable[[], None]) -> None:
-    """Do something on a thread of its own."""
-    done = Future()
-
-    def run() -> None:
-        try:
-            work()
-        except Exception as error:
-            done.set_exception(error)
-        else:
-            done.set_result(None)
-
-    threading.Thread(target=run, name='save map').start()
-    await done

@@ -18,7 +18,7 @@ from segfloor_ros.nodes.shared.stage_node import StageNode
 from segfloor_ros.nodes.shared.stamp_order import InTime, StampOrder
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.nodes.slam_camera import Pair, StereoInput
-from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamMaps, SlamResults
+from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamResults
 from segfloor_ros.nodes.slam_sensors import InitialPose, MaskInput, SensorInput
 
 
@@ -31,6 +31,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
 
     def set_up(self) -> None:
         """Make the topics."""
+        from segfloor_ros.nodes.slam_maps import SlamMaps
         from segfloor_ros.nodes.watches.camera import CameraWatch
         from segfloor_ros.nodes.watches.tf import RivalWatch
 

@@ -59,7 +59,8 @@ def test_frames_of_submaps_that_were_not_merged_are_counted_and_named():
     others = dict.fromkeys(
         (
             'skipped_frames', 'keyframes', 'map_updates', 'sensors', 'sensor_remarks',
-            'input_faults', 'failed_frames', 'failed_keyframes', 'interrupted', 'stages', 'rss_mb',
+            'input_faults', 'failed_frames', 'failed_keyframes', 'floor', 'interrupted', 'stages',
+            'rss_mb',
         ),
         0,
     )  # fmt: skip

@@ -1,13 +1,19 @@
-"""What a camera maps while it is lost, over DDS: all of it arrives once the map is recognised."""
+"""What is held back, while a camera is lost or its mount is not known: all of it arrives later, and
+what is newest is soon among it.
+"""
 
 from __future__ import annotations
 
 import pytest
 from stereo_drive import write_kitti
-from stereo_room import MOUNT, StereoRoom, planar_pose
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.apps.stereo_camera import make_stereo_camera
+from segfloor_ros.core.plugins.assembly import make_slam
+from segfloor_ros.core.slam.settings import StereoSlamSettings
+from segfloor_ros.nodes.messages.camera_infos import rectified_calibration
 from segfloor_ros.nodes.messages.topics import to_ns
+from segfloor_ros.nodes.slam_outputs import CameraFrames
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 KNOWN = [planar_pose(0.04 * k, 0.0, 0.03 * k) for k in range(20)]
@@ -41,3 +47,20 @@ def test_more_held_results_than_a_queue_holds_arrive(make_graph, tmp_path) -> No
     # No pose for 1.5 s, until it maps on its own; then all of more than a queue holds.
     assert lost == list(range(len(KNOWN), len(KNOWN) + len(lost)))
     assert 10 < len(lost) < len(poses) - len(KNOWN) - len(ON) - QUEUE
+
+
+def test_what_was_held_back_does_not_delay_what_is_newest(make_graph) -> None:
+    """Tracking leaves the node no time for anything else: results go out all the same."""
+    room = StereoRoom()
+    frames = [room.frame(k, planar_pose(0.02 * k, 0.0, 0.0), 10.0) for k in range(41)]
+    settings = StereoSlamSettings(num_features=600)
+    slam = make_slam(CAMERA, settings, mount=MOUNT)
+    results = [result for frame in frames for result in slam.process(frame)]
+    graph = make_graph()
+    node = graph.add(StereoSlamNode())
+    sent = node._results
+    sent.topics.begin(rectified_calibration(CAMERA), CameraFrames('left', 'right'))
+    held, *later = results[:20], *([result] for result in results[20:])
+    for batch in (held, *later):  # with no turn of the executor in between
+        sent.add(batch, slam, 30.0)
+    assert sent.topics.newest_ns == frames[-1].stamp_ns

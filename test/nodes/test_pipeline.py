@@ -1,23 +1,30 @@
-"""The five nodes in one process."""
+"""The five nodes in one program, of two processes."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
-from ros_graph import fresh_graph
+from ros_graph import fresh_graph, surroundings
 from std_srvs.srv import SetBool, Trigger
 from stereo_drive import lockstep_map, room_drive, write_kitti
 
 from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.nodes.messages.topics import CAMERA, GRID, NODES, SLAM, published_by, to_ns
+from segfloor_ros.nodes.shared.kept_state import KeptState
 
 FRAMES = 14
+
+PIPELINE = (sys.executable, '-m', 'segfloor_ros.apps.segfloor_pipeline')
 
 
 @pytest.fixture(scope='module')
@@ -32,7 +39,7 @@ def pipeline(drive, tmp_path_factory):
     parameters = {'input': drive, 'rate': 0.0, 'start_paused': 'true', 'background': 'false',
                   'map_file': folder / 'map.yaml'}  # fmt: skip
     options = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
-    command = [sys.executable, '-m', 'segfloor_ros.apps.segfloor_pipeline', '--ros-args']
+    command = [*PIPELINE, '--ros-args']
     with fresh_graph() as graph, (folder / 'log').open('w') as log:
         process = subprocess.Popen([*command, *options], stdout=log, stderr=log)
         try:
@@ -75,3 +82,73 @@ def test_it_has_the_topics_of_the_five_nodes_and_ends_on_interrupt(pipeline) -> 
         time.sleep(0.01)
     assert process.returncode == 0
     assert 'Traceback' not in (folder / 'log').read_text()
+
+
+def helpers_of(process: subprocess.Popen) -> list[int]:
+    """Return the processes that a process has started."""
+    listed = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text()
+    return [int(word) for word in listed.split()]
+
+
+def is_running(process_id: int) -> bool:
+    with contextlib.suppress(OSError):
+        state = Path(f'/proc/{process_id}/stat').read_text().rpartition(')')[2].split()[0]
+        return state != 'Z'
+    return False
+
+
+def wait_until(is_so: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + 60
+    while not is_so():
+        assert time.monotonic() < end_s
+        time.sleep(0.1)
+
+
+def test_a_process_that_is_stopped_and_goes_on_ends_nothing(tmp_path) -> None:
+    said = tmp_path / 'log'
+    with surroundings(), said.open('w') as log:
+        process = subprocess.Popen(PIPELINE, stdout=log, stderr=log)
+        try:
+            wait_until(lambda: f'[{SLAM}]' in said.read_text())
+            (helper,) = helpers_of(process)
+            for number in (signal.SIGSTOP, signal.SIGCONT):
+                os.kill(helper, number)
+                time.sleep(0.3)
+            assert is_running(process.pid) and is_running(helper)
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 0
+        finally:
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.parametrize('victim', ['SLAM', 'the others'])
+def test_when_one_process_is_killed_the_other_one_ends(victim, tmp_path) -> None:
+    said = tmp_path / 'log'
+    with surroundings(), said.open('w') as log:
+        process = subprocess.Popen(PIPELINE, stdout=log, stderr=log)
+        try:
+            wait_until(lambda: f'[{SLAM}]' in said.read_text())
+            (helper,) = helpers_of(process)
+            wait_until(lambda: len(os.listdir(f'/proc/{helper}/task')) > 5)  # its middleware runs
+            time.sleep(3)  # what was kept before is taken up or dropped
+            kept = KeptState(GRID if victim == 'SLAM' else SLAM, 60.0)
+            kept.note({'of': 'the process that is not killed'})
+            os.kill(process.pid if victim == 'SLAM' else helper, signal.SIGKILL)
+            status = process.wait(30)
+            wait_until(lambda: not is_running(helper))
+            assert kept.file.with_suffix('.json').exists()
+        finally:
+            process.kill()
+            process.wait()
+    assert status == (-signal.SIGKILL if victim == 'SLAM' else 128 + signal.SIGKILL)
+
+
+@pytest.mark.parametrize('parameter', ['input:=nowhere', 'num_featurs:=3', 'num_features:=-1'])
+def test_a_mistake_of_any_node_ends_it_with_one_line(parameter) -> None:
+    with surroundings():
+        words = (*PIPELINE, '--ros-args', '-p', parameter)
+        done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    lines = [line for line in done.stderr.splitlines() if line.startswith('segfloor: ')]
+    assert (done.returncode, len(lines)) == (2, 1), done.stderr
+    assert 'Traceback' not in done.stderr

@@ -42,6 +42,7 @@ from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.grid.mapper import OccupancyGridMapper
 from segfloor_ros.core.grid.occupancy import OccupancyGridSettings
+from segfloor_ros.core.slam.drift import SCALE_SIGMA
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.messages.camera_infos import (
@@ -183,6 +184,11 @@ class TestStereoSlam:
             for covariance in (message.pose.covariance, message.twist.covariance):
                 assert (np.diag(np.reshape(covariance, (6, 6))) > 0).all()
         assert 0 < received['odometry'][-1].twist.covariance[0] < 0.1
+        # Errors of the calibration alone are a share of the way.
+        grown = [message.pose.covariance[0] for message in received['odometry']]
+        way_m = float(np.linalg.norm((invert(truth[0]) @ truth[frames[-1].index])[:3, 3]))
+        assert grown == sorted(grown)
+        assert SCALE_SIGMA * way_m < np.sqrt(grown[-1]) < 0.05 * way_m
         path = path_arrays(received['keyframe/path'][-1])
         assert path.stamp_ns.tolist() == keyframes
         np.testing.assert_array_equal(

@@ -14,8 +14,15 @@ from rich.table import Table
 from rich.text import Text
 
 from segfloor_ros.apps.cli.printing import console, print_error
-from segfloor_ros.apps.cli.terminal import View, figure_table, number_option
-from segfloor_ros.apps.cli.view import open_view, show_results
+from segfloor_ros.apps.cli.terminal import (
+    Json,
+    View,
+    figure_table,
+    json_alone,
+    number_option,
+    print_json,
+)
+from segfloor_ros.apps.cli.view import open_view, read_results, show_results
 from segfloor_ros.apps.results_folder import OUTPUT_NAMES
 from segfloor_ros.apps.suite.description import Suite, read_suite
 from segfloor_ros.apps.suite.job import LOG, SAVED_MAP, Job, Outcome, outcomes, package_digest
@@ -42,12 +49,17 @@ from segfloor_ros.core.files.writing import (
 )
 from segfloor_ros.core.geometry import Pose2d
 
-COLUMNS = ('tracked_percent', 'path_error_m', 'precision_percent', 'recall_percent', 'time_ratio')
+COLUMNS = {
+    'tracked_percent': 'tracked %',
+    'path_error_m': 'error m',
+    'precision_percent': 'prec. %',
+    'recall_percent': 'recall %',
+    'time_ratio': 'time',
+}
+LENGTHS = {'length_m': 'length m', 'true_length_m': 'true m'}
 JUNIT, PAGE, FAILED = 'junit.xml', 'suite.html', 'failed.txt'
 FILES = (*OUTPUT_NAMES, MEASURED, LOG, SAVED_MAP, FAILED)
 """In the folder of a recording."""
-
-HEADINGS = ('tracked %', 'error m', 'prec. %', 'recall %', 'time')
 
 
 def check_suite(
@@ -84,6 +96,7 @@ def check_suite(
         bool, typer.Option('--no-cache', help='Map every recording, whatever the cache has.')
     ] = False,
     view: View = None,
+    as_json: Json = False,
 ) -> None:
     """Map recordings and hold the results against bounds. Status 1: a bound failed.
 
@@ -105,6 +118,7 @@ def check_suite(
     todo = _jobs(described, folder, not no_cache)
     found: dict[str, Checked] = {}
     with (
+        json_alone(as_json),
         folder_in_the_making(out),
         open_view(view) as shown,
         contextlib.closing(_all_outcomes(todo, out, resume, jobs, scheduler)) as results,
@@ -117,14 +131,25 @@ def check_suite(
             found[checked.name] = checked
             _print_progress(checked, len(found), len(todo))
             if shown is not None and not outcome.problem:
-                show_results(shown, out / outcome.name, outcome.name)
+                show_results(shown, read_results(out / outcome.name), outcome.name)
         result = SuiteResult(described.name, [found[entry.name] for entry in described.entries])
         _finish(result, out, described, known)
     if baseline_to_write is not None:
         write_baseline(result, baseline_to_write)
-        console.print(f'baseline: {baseline_to_write}', soft_wrap=True)
+        with json_alone(as_json):
+            console.print(f'baseline: {baseline_to_write}', soft_wrap=True)
+    if as_json:
+        print_json(_as_document(result))
     if not result.holds:
         raise typer.Exit(1)
+
+
+def _as_document(result: SuiteResult) -> dict[str, Any]:
+    recordings = [
+        {'name': one.name, 'state': one.state, 'measured': one.measured, 'wrong': one.complaints}
+        for one in result.recordings
+    ]
+    return {'name': result.name, 'holds': result.holds, 'recordings': recordings}
 
 
 def _check_out(out: Path, suite: Suite) -> None:
@@ -234,13 +259,15 @@ def _print_progress(checked: Checked, done: int, total: int) -> None:
 
 def _table(result: SuiteResult, described: Suite) -> Table:
     methods = list(described.published)
-    table = figure_table('recording', 'result', *HEADINGS, *methods)
+    is_length = described.published_measure == 'length_m'
+    columns = {**COLUMNS, **LENGTHS} if is_length else COLUMNS
+    table = figure_table('recording', 'result', *columns.values(), *methods)
     if methods:
         sources = (f'{method}: {source}' for method, source in described.published.items())
-        table.caption = 'error m of ' + '; '.join(sources)
+        table.caption = f'{"length" if is_length else "error"} m of ' + '; '.join(sources)
     for entry, checked in zip(described.entries, result.recordings, strict=True):
         state = Text(checked.state, 'green' if checked.holds else 'red')
-        values = [checked.measured.get(name) for name in COLUMNS]
+        values = [checked.measured.get(name) for name in columns]
         values += [entry.published.get(method) for method in methods]
         cells = ('' if value is None else number(value) for value in values)
         table.add_row(checked.name, state, *cells)

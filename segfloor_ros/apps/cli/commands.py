@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from functools import partial
 from importlib import resources, util
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
@@ -94,7 +94,10 @@ def run(
         if drive.broken_off is not None:
             remarks.append(f'{drive.broken_off}; the map is of what came before')
             status = status or 2
-        terminal.finish_run(options.input, options.out, folder, options.report, remarks, status)
+        figures = result.summary if options.as_json else None
+        terminal.finish_run(
+            options.input, options.out, folder, options.report, remarks, status, figures
+        )
 
 
 @contextmanager
@@ -172,8 +175,9 @@ def replay(
             f'keyframes that failed: {found.failed_keyframes}'
         )
         status = interrupt.status or found.status
+        figures = result.summary if options.as_json else None
         terminal.finish_run(
-            options.input, options.out, folder, options.report, found.notices, status
+            options.input, options.out, folder, options.report, found.notices, status, figures
         )
 
 
@@ -187,6 +191,7 @@ def demo(
     lockstep: Annotated[
         bool, typer.Option('--lockstep', help='Without ROS: one process in place of five nodes.')
     ] = False,
+    as_json: terminal.Json = False,
 ) -> None:
     """Map a recorded drive through a corridor with the five nodes and score the map.
 
@@ -194,6 +199,13 @@ def demo(
     segfloor demo
     segfloor demo --lockstep --out demo
     """
+    with terminal.json_alone(as_json):
+        scores = _demo(out, rate, lockstep)
+    if as_json:
+        terminal.print_json(scores)
+
+
+def _demo(out: Path, rate: float, lockstep: bool) -> dict[str, Any]:
     drive = str(DRIVE / 'drive.mcap')
     if lockstep or util.find_spec('rclpy') is None:
         console.print('mapping a simulated drive through a corridor, in one process without ROS')
@@ -201,26 +213,34 @@ def demo(
     else:
         console.print('replaying a simulated drive through a corridor through the five nodes')
         replay(input=drive, out=out, rate=rate)
-    _print_scores(out)
+    return _print_scores(out)
 
 
-def _print_scores(out: Path) -> None:
-    """Print how good map and path are; the last line is the path of the report."""
+def _print_scores(out: Path) -> dict[str, Any]:
+    """Print and return how good map and path are; the last line is the path of the report."""
     # Imported here: evo and matplotlib take a second that no other command should wait for.
     from segfloor_ros.apps.evaluation.report import write_report
-    from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
 
     truth = load_truth(DRIVE)
     grid = load_map(out / 'map.yaml')
-    console.print(map_table(score_map(grid, truth)))
-    path = score_trajectory(match_files(out, DRIVE))
-    console.print(
-        f'path: {path.path_length_m:.1f} m, {100 * path.tracked:.1f} % of the frames tracked, '
-        f'error {100 * path.ate_rmse_m:.1f} cm (RMSE after alignment)'
-    )
+    score = score_map(grid, truth)
+    scores: dict[str, Any] = {'map': dataclasses.asdict(score), 'path': None}
+    console.print(map_table(score))
+    try:
+        from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
+    except ModuleNotFoundError:  # evo is an extra
+        console.print("path: its error is measured after pip install 'segfloor_ros[evaluate]'")
+    else:
+        path = score_trajectory(match_files(out, DRIVE))
+        scores['path'] = dataclasses.asdict(path)
+        console.print(
+            f'path: {path.path_length_m:.1f} m, {100 * path.tracked:.1f} % of the frames tracked, '
+            f'error {100 * path.ate_rmse_m:.1f} cm (RMSE after alignment)'
+        )
     add_files(out, {'overlay.png': overlay_png(compare(grid, truth))})
     console.print(f'map on the truth: {out / "overlay.png"}', soft_wrap=True)
     console.print(str(write_report(out, DRIVE)), soft_wrap=True)
+    return scores
 
 
 def params() -> None:
@@ -285,6 +305,7 @@ def simulate(
             '--list', help='List the shipped scenes.', callback=_list_scenes, is_eager=True
         ),
     ] = False,
+    as_json: terminal.Json = False,
 ) -> None:
     """Render a drive with exact truth: images, calibration, poses, map and floor masks.
 
@@ -307,11 +328,12 @@ def simulate(
         terminal.progress_bar('rendering', simulation.frame_count) as progress,
     ):
         record(simulation, out, wanted, progress)
-        seconds = simulation.drive.times_s[-1]
-        facts = (
-            f'{simulation.frame_count} pairs, {simulation.drive.length_m:.1f} m, {seconds:.0f} s'
-        )
-    console.print(f'{facts}: {out}')
+        pairs, drive = simulation.frame_count, simulation.drive
+    seconds = float(drive.times_s[-1])
+    if as_json:
+        facts = {'pairs': pairs, 'path_m': drive.length_m, 'duration_s': seconds, 'out': str(out)}
+        return terminal.print_json(facts)
+    console.print(f'{pairs} pairs, {drive.length_m:.1f} m, {seconds:.0f} s: {out}')
 
 
 @terminal.with_options

@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
@@ -54,6 +55,9 @@ from segfloor_ros.core.files.writing import PNG, check_output, marked_png, write
 from segfloor_ros.core.geometry import Pose2d
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 
+if TYPE_CHECKING:
+    from segfloor_ros.apps.evaluation.trajectory import TrajectoryScore
+
 app = typer.Typer(help='Score a map, a trajectory or floor masks against the truth.')
 
 
@@ -83,7 +87,7 @@ def evaluate_map(
     repetitions: Annotated[int, number_option('Road maps to average.', 1)] = 30,
     seed: Annotated[int, number_option('Of the random nodes.', 0)] = 0,
     sight: Annotated[
-        float, number_option('How far the camera is said to see, in m.', 0.1, 1000.0)
+        float, number_option('Range of the camera, in m.', 0.1, 1000.0)
     ] = DEFAULT_RANGE_M,
     fov: Annotated[
         float | None,
@@ -118,11 +122,13 @@ def evaluate_map(
 
 @app.command('trajectory')
 def evaluate_trajectory(
-    estimate: Annotated[
-        Path, typer.Argument(metavar='EST', help='TUM or KITTI file, or a run folder.')
-    ],
-    truth: Annotated[
-        Path, typer.Argument(metavar='TRUTH', help='TUM or KITTI file, or a recording folder.')
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar='EST... TRUTH',
+            help='Estimates, each a TUM or KITTI file or a run folder, and at last the truth: a '
+            'TUM or KITTI file or a recording folder.',
+        ),
     ],
     frames: Annotated[
         int | None, number_option('Frames of the recording; else one per true pose.', 1)
@@ -130,10 +136,11 @@ def evaluate_trajectory(
     plot: Annotated[Path | None, typer.Option(help='Write a picture (PNG).')] = None,
     as_json: Json = False,
 ) -> None:
-    """ATE and RPE after rigid alignment, with the share of frames that were tracked.
+    """ATE and RPE after rigid alignment, path lengths, and the share of frames that were tracked.
 
     \b
     segfloor evaluate trajectory result corridor1 --plot path.png
+    segfloor evaluate trajectory with_masks without orb.txt corridor1 --plot paths.png
     """
     # Imported here: evo and matplotlib take a second that no other command should wait for.
     from segfloor_ros.apps.evaluation.trajectory import (
@@ -143,25 +150,67 @@ def evaluate_trajectory(
         score_trajectory,
     )
 
+    *estimates, truth = paths
+    if not estimates:
+        raise SettingsError(f'{truth}: give one estimate or more, and at last the truth')
     if plot is not None:
-        check_plot(plot, [estimate, truth])
-    matched = match_files(estimate, truth, frames)
-    score = score_trajectory(matched)
+        check_plot(plot, paths)
+    matched = {
+        name: match_files(estimate, truth, frames)
+        for name, estimate in zip(short_names(estimates), estimates, strict=True)
+    }
+    scores = {name: score_trajectory(one) for name, one in matched.items()}
     if plot is not None:
         save_trajectory_plot(matched, plot)
     if as_json:
-        return print_json(dataclasses.asdict(score))
-    rows = [
-        ('frames tracked', f'{100 * score.tracked:.1f} % of {score.frames}'),
-        ('path length', f'{score.path_length_m:.2f} m'),
-        ('ATE (RMSE, aligned)', f'{score.ate_rmse_m:.4f} m'),
-        ('ATE (largest)', f'{score.ate_max_m:.4f} m'),
-        ('RPE over 1 m', f'{score.rpe_translation_m:.4f} m, {score.rpe_rotation_rad:.5f} rad'),
-        ('error at the end', f'{score.end_error_m:.4f} m'),
-    ]
-    console.print(value_table('measure', rows))
+        documents = {name: dataclasses.asdict(score) for name, score in scores.items()}
+        return print_json(documents if len(scores) > 1 else next(iter(documents.values())))
+    if len(scores) > 1:
+        console.print(trajectories_table(scores))
+    else:
+        (score,) = scores.values()
+        rows = [
+            ('frames tracked', f'{100 * score.tracked:.1f} % of {score.frames}'),
+            ('path length', f'{score.estimate_length_m:.2f} m, true {score.path_length_m:.2f} m'),
+            ('ATE (RMSE, aligned)', f'{score.ate_rmse_m:.4f} m'),
+            ('ATE (largest)', f'{score.ate_max_m:.4f} m'),
+            ('RPE over 1 m', f'{score.rpe_translation_m:.4f} m, {score.rpe_rotation_rad:.5f} rad'),
+            ('error at the end', f'{score.end_error_m:.4f} m'),
+        ]
+        console.print(value_table('measure', rows))
     if plot is not None:
         console.print(f'plot: {plot}', soft_wrap=True)
+
+
+def short_names(paths: Sequence[Path]) -> list[str]:
+    """Return a name for each path: the fewest of its last parts that no other one ends with."""
+    parts = [path.resolve().with_suffix('').parts for path in paths]
+    most = max(map(len, parts))
+    for count in range(1, most):
+        names = ['/'.join(some[-count:]) for some in parts]
+        if len(set(names)) == len(names):
+            return names
+    return [f'{number}: {path}' for number, path in enumerate(paths, 1)]
+
+
+def trajectories_table(scores: Mapping[str, TrajectoryScore]) -> Table:
+    """Return the scores of several estimates of one drive side by side."""
+    table = figure_table(
+        'estimate', 'tracked %', 'length m', 'true m', 'ATE m', 'RPE m', 'RPE rad', 'end m'
+    )
+    for name, score in scores.items():
+        table.add_row(
+            name,
+            f'{100 * score.tracked:.1f}',
+            f'{score.estimate_length_m:.2f}',
+            f'{score.path_length_m:.2f}',
+            f'{score.ate_rmse_m:.4f}',
+            f'{score.rpe_translation_m:.4f}',
+            f'{score.rpe_rotation_rad:.5f}',
+            f'{score.end_error_m:.4f}',
+        )
+    table.caption = 'lengths between the poses that estimate and truth have in common'
+    return table
 
 
 @app.command('floor')

@@ -26,7 +26,7 @@ from std_srvs.srv import Trigger
 from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.apps.cli.replay_nodes import STALL_S, NodeGraph, ReplayError, running_nodes
 from segfloor_ros.apps.cli.replay_session import cpu_s
-from segfloor_ros.apps.cli.terminal import ExploreOptions, progress_bar, value_table
+from segfloor_ros.apps.cli.terminal import ExploreOptions, print_json, progress_bar, value_table
 from segfloor_ros.apps.evaluation.exploration import (
     Exploration,
     Moment,
@@ -76,6 +76,22 @@ FILES = (GOALS, SAVED, 'map.pgm', 'map.yaml', 'true_map.pgm', 'true_map.yaml', '
 
 CRUISE_M_S, TURN_RAD_S = 0.4, 0.6
 """No faster, whatever the robot can: SLAM follows these surely."""
+
+WORDS = {
+    'mapped_share': 'share of the floor that is mapped',
+    'goals_reached': 'goals reached',
+    'goals_total': 'goals',
+    'path_rmse_m': 'error of the path, RMSE [m]',
+    'free_precision': 'share of free cells that are floor',
+    'free_recall': 'share of the floor that is free',
+    'tracked_share': 'share of the frames with a pose',
+    'path_m': 'distance [m]',
+    'sim_s': 'duration [s]',
+    'wall_s': 'computed in [s]',
+    'real_time_factor': 'speed, 1 is real time',
+    'map_in_scene': 'start of the map in the scene (x, y, yaw)',
+}
+"""Names of figures, in words."""
 
 STANDING_S = 3.0
 """So long the robot stands at first, as any does while it starts: SLAM learns the bias of its
@@ -360,7 +376,10 @@ def explore_scene(options: ExploreOptions) -> None:
         with os_errors(f'{options.out}: cannot be written'):
             _write(made, found, task.truth, summary, task.named)
             move_into_place(made, options.out)
-    rows = [(name, str(value)) for name, value in summary.items() if name != 'cpu_s']
+    if options.as_json:
+        print_json(summary)
+    rows = [(WORDS.get(name, name), str(value)) for name, value in summary.items()]
+    rows = [row for row in rows if row[0] != 'cpu_s']
     console.print(value_table('exploration', rows, options.scene))
     console.print(str(options.out / 'explored.png'), highlight=False, soft_wrap=True)
     if interrupt.status:

@@ -27,8 +27,8 @@ COMMANDS = {
     'replay': ('commands:replay', 'Map a recording with the five ROS 2 nodes over DDS.'),
     'info': (
         'recordings:info',
-        'Say what an input is, and whether it will do: topics or folders, rates, gaps, '
-        'calibration, sensors, and what some dozens of pairs show to be wrong, with what to do.',
+        'Describe an input, and whether it can be mapped: topics or folders, rates, gaps, '
+        'calibration, sensors, and faults that some dozens of pairs show, with remedies.',
     ),
     'view': (
         'recordings:view',
@@ -49,7 +49,7 @@ COMMANDS = {
     ),
     'convert': (
         'recordings:convert',
-        'Convert a recording to a rosbag2 (mcap) with images, CameraInfo and what was measured.',
+        'Convert a recording to a rosbag2 (mcap), or to a folder as of KITTI or TUM RGB-D.',
     ),
     'record': (
         'recordings:record',
@@ -69,16 +69,15 @@ COMMANDS = {
         'Map recordings and hold the results against bounds. Status 1: a bound failed.',
     ),
     'evaluate': ('evaluate:app', 'Score a map, a trajectory or floor masks against the truth.'),
-    'map': ('maps:app', 'Look at saved maps, compare, merge and prune them.'),
+    'map': ('maps:app', 'Look at saved maps, compare, merge, prune and correct them.'),
 }
 """Where each command is, and what it does, in the words of its own help."""
 
 EXTRAS = {
-    'evo': 'cli', 'junitparser': 'cli', 'matplotlib': 'cli', 'rosbags': 'cli',
-    'distributed': 'cluster', 'fsspec': 'cluster', 'mujoco': 'sim', 'onnxruntime': 'onnx',
-    'rerun': 'view', 'rclpy': 'ros',
+    'evo': 'evaluate', 'distributed': 'cluster', 'fsspec': 'cluster', 'mujoco': 'sim',
+    'onnxruntime': 'onnx', 'rerun': 'view', 'rclpy': 'ros',
 }  # fmt: skip
-"""The extra of setup.py that has a package."""
+"""The extra of setup.py that has a package; the others come with the wheel."""
 
 BY_APT = {'matplotlib', 'numpy', 'scipy', 'yaml'}
 """Packages that Ubuntu has as python3-NAME."""
@@ -176,10 +175,12 @@ def run_app(make_app: Callable[[], typer.Typer]) -> None:
     logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
     status: str | int | None = 0
     try:
+        from segfloor_ros.apps.cli.help_panels import laid_out
+
         app = make_app()
         signal.signal(signal.SIGINT, signal.default_int_handler)
         with terminated_like_interrupted():
-            app(args=with_optional_values(sys.argv[1:]))
+            laid_out(app)(args=with_optional_values(sys.argv[1:]))
     except SystemExit as ended:
         status = ended.code
     except KeyboardInterrupt:

@@ -1,11 +1,14 @@
 """`segfloor map`: what can be done with saved maps, the files of `--save-map`, without driving:
-look at them, compare them, make one of two, leave out what is old.
+look at them, compare them, make one of two, leave out what is old, correct them by hand.
 """
 
 from __future__ import annotations
 
 import datetime
+import os
+import webbrowser
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,12 +19,12 @@ import typer
 from numpy.typing import NDArray
 
 from segfloor_ros.apps.cli.printing import console
-from segfloor_ros.apps.cli.terminal import Json, print_json, value_table
+from segfloor_ros.apps.cli.terminal import Json, number_option, print_json, value_table
 from segfloor_ros.apps.evaluation.maps import resample
 from segfloor_ros.apps.label_files import draw_labels, filter_mask, save_labels
 from segfloor_ros.apps.map_files import is_map, load_map, map_facts
 from segfloor_ros.core.contracts import KeyframePath, SparseCloud
-from segfloor_ros.core.errors import InputError, MapError, SettingsError
+from segfloor_ros.core.errors import InputError, MapError, SettingsError, os_errors
 from segfloor_ros.core.files.arrays import Arrays, MapFile
 from segfloor_ros.core.files.images import png_bytes
 from segfloor_ros.core.files.results import SAVED_MAP, read_map_file, write_map_file
@@ -58,7 +61,7 @@ KEEPOUT = 'type: 0, base: 0.0, multiplier: 1.0'
 SPEED = 'type: 1, base: 100.0, multiplier: -1.0'
 """Parameters of Nav2's server for each kind of mask."""
 
-app = typer.Typer(help='Look at saved maps, compare, merge and prune them.')
+app = typer.Typer(help='Look at saved maps, compare, merge, prune and correct them.')
 
 FirstMap = Annotated[Path, typer.Argument(metavar='A', help='File of --save-map.')]
 SecondMap = Annotated[Path, typer.Argument(metavar='B', help='File of --save-map.')]
@@ -71,7 +74,7 @@ def info(
     path: Annotated[Path, typer.Argument(metavar='FILE', help='File of --save-map, or map.yaml.')],
     as_json: Json = False,
 ) -> None:
-    """Say what a saved map holds: drives with dates, keyframes, areas, camera; of a map.yaml size,
+    """Describe a saved map: drives with dates, keyframes, areas, camera; of a map.yaml size,
     areas and resolution.
 
     \b
@@ -237,6 +240,53 @@ def filter_labels(
     save_map(filter_mask(labels, percent), out, 'raw')
     words = f'mask: {out}; costmap_filter_info_server: {KEEPOUT if keepout else SPEED}'
     console.print(words, soft_wrap=True)
+
+
+@app.command('edit')
+def edit(
+    path: Annotated[
+        Path, typer.Argument(metavar='MAP', help='map.yaml of map_server, or file of --save-map.')
+    ],
+    out: Annotated[Path, typer.Argument(metavar='OUT.yaml', help='The corrected map.')],
+    port: Annotated[int, number_option('Of the page; 0: any that is free.', 0, 65535)] = 0,
+) -> None:
+    """Correct a map in the browser: erase, draw walls and keepout zones, undo.
+
+    MAP stays as it is. Save writes OUT.yaml, and OUT_keepout.yaml for Nav2's keepout filter where a
+    zone was drawn. The page is on this machine alone, until Ctrl-C.
+
+    \b
+    segfloor map edit result/map.yaml corrected.yaml
+    """
+    from segfloor_ros.apps.cli.map_editor import editor_server
+
+    grid = load_map(path) if is_map(path) else open_map(path).grid()
+    beside = out.with_name(f'{out.stem}_keepout.yaml')
+    for target in (out, beside):
+        check_map_output(target, [path])
+
+    def save(corrected: OccupancyGrid, zones: OccupancyGrid | None) -> str:
+        save_map(corrected, out)
+        words = f'saved: {out}'
+        if zones is not None:
+            save_map(zones, beside, 'raw')
+            words = f'{words}; keepout mask: {beside}; costmap_filter_info_server: {KEEPOUT}'
+        elif os.path.lexists(beside):
+            nothing = np.zeros(corrected.cells.shape, np.int8)
+            none = OccupancyGrid(nothing, corrected.resolution_m, corrected.origin_xy_m)
+            save_map(none, beside, 'raw')
+            words = f'{words}; no zone is left in the keepout mask: {beside}'
+        console.print(words, soft_wrap=True)
+        return words
+
+    with os_errors(f'--port {port}'):
+        server, address = editor_server(grid, str(path), save, port)
+    with server, suppress(KeyboardInterrupt):
+        console.print(f'page: {address}', soft_wrap=True)
+        console.print('it is there until Ctrl-C')
+        if os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'):
+            webbrowser.open(address)
+        server.serve_forever()
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import dataclasses
 import re
 from importlib import util
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
@@ -25,11 +25,12 @@ from segfloor_ros.apps.calibration import (
 from segfloor_ros.apps.cli import printing, terminal
 from segfloor_ros.apps.cli.printing import console
 from segfloor_ros.apps.cli.terminal import figure_table, number_option, value_table
-from segfloor_ros.apps.cli.view import open_view, show_recording, show_results
+from segfloor_ros.apps.cli.view import open_view, read_results, show_recording, show_results
 from segfloor_ros.apps.map_files import is_map, load_map, map_facts
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.bag_writer import BagWriter, ImageCoding, NewBag
 from segfloor_ros.apps.recordings.bag_writer import convert as write_bag
+from segfloor_ros.apps.recordings.folder_writer import Layout, layout_for, read_truth, write_folder
 from segfloor_ros.apps.recordings.opening import Inspection, Stream, inspect_recording, size_mb
 from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.apps.results_folder import read_summary
@@ -41,6 +42,13 @@ from segfloor_ros.core.files.writing import write_output
 from segfloor_ros.core.plugins.rig.check import SETTLED_FRAMES
 from segfloor_ros.core.processes import Interrupt, first_interrupt_noted
 
+NEXT = (
+    'copy left.yaml and right.yaml beside the images, or name them by '
+    'stereo_camera.left_calibration and right_calibration; then try segfloor calibrate --check '
+    'RECORDING'
+)
+"""What to do with a good calibration."""
+
 
 @terminal.with_options
 def info(
@@ -49,8 +57,8 @@ def info(
     depth: terminal.Depth = False,
     as_json: terminal.Json = False,
 ) -> None:
-    """Say what an input is, and whether it will do: topics or folders, rates, gaps, calibration,
-    sensors, and what some dozens of pairs show to be wrong, with what to do.
+    """Describe an input, and whether it can be mapped: topics or folders, rates, gaps, calibration,
+    sensors, and faults that some dozens of pairs show, with remedies.
 
     \b
     segfloor info drive.mcap
@@ -71,7 +79,7 @@ def info(
         return terminal.print_json(dataclasses.asdict(found))
     console.print(value_table('recording', _rows(found), found.name))
     console.print(_stream_table(found.streams))
-    for line in found.to_mend or ['nothing to mend']:
+    for line in found.to_mend or ['nothing to fix']:
         console.print(f'- {line}', soft_wrap=True)
 
 
@@ -143,6 +151,7 @@ def record(
     ] = ImageCoding.raw,
     params: terminal.Params = None,
     assignments: terminal.Set = None,
+    as_json: terminal.Json = False,
 ) -> None:
     """Record topics of the live graph, or a camera of this machine, to a rosbag2 (mcap).
 
@@ -154,13 +163,16 @@ def record(
     segfloor record drive.mcap --topics "/camera/.*|/imu" --seconds 60
     segfloor record drive.mcap --device 0,2 --images jpeg --set stereo_camera.exposure_s=0.005
     """
-    with first_interrupt_noted() as interrupt:
+    with terminal.json_alone(as_json), first_interrupt_noted() as interrupt:
         if device is None:
             is_full = _record_topics(out, topics, seconds, interrupt)
         else:
             settings = terminal.configuration(params, assignments, device).stereo_camera
             is_full = _record_device(out, open_source(settings), images, seconds, interrupt)
-    console.print(f'{size_mb(out):.1f} MB: {out}')
+    if as_json:
+        terminal.print_json({'size_mb': size_mb(out), 'is_disk_full': is_full, 'out': str(out)})
+    else:
+        console.print(f'{size_mb(out):.1f} MB: {out}')
     if is_full:
         raise InputError(f'{out}: the disk is almost full; what came until then is in the file')
 
@@ -235,41 +247,74 @@ def view(
     """
     folder = user_path(options.input)
     has_results = not live and (folder / 'summary.json').is_file()
-    source = None
-    if not (live or has_results):  # what cannot be read ends before a window is opened
+    source = results = None  # what cannot be read ends before a window is opened
+    if live:
+        with terminal.needing_ros('--live'):
+            from segfloor_ros.apps.cli.replay_recorder import watch
+    elif has_results:
+        results = read_results(folder)
+    else:
         source = open_source(options.configuration().stereo_camera)
     with open_view(str(out or ''), [options.input, options.params]) as shown:
         assert shown is not None
-        if live:
-            with terminal.needing_ros('--live'):
-                from segfloor_ros.apps.cli.replay_recorder import watch
-            watch(shown, options.input)
-        elif source is None:
-            show_results(shown, folder)
-        else:
+        if results is not None:
+            show_results(shown, results)
+        elif source is not None:
             show_recording(shown, source)
+        else:
+            watch(shown, options.input)
 
 
 @terminal.with_options
 def convert(
     options: terminal.InputOptions,
-    out: Annotated[Path, typer.Argument(help='New bag, e.g. drive.mcap.', metavar='OUT.mcap')],
+    out: Annotated[
+        Path, typer.Argument(help='New bag, e.g. drive.mcap, or new folder.', metavar='OUT')
+    ],
+    layout: Annotated[
+        Layout | None,
+        typer.Option(
+            help='What is written; else a bag becomes a folder, of TUM with depth in place of '
+            'right images, of KITTI without, and anything else a bag.',
+            show_default=False,
+        ),
+    ] = None,
+    truth: Annotated[
+        str | None,
+        typer.Option(
+            metavar='TOPIC',
+            help='True poses for a folder: an Odometry of the bag, or a file (TUM or KITTI).',
+        ),
+    ] = None,
     images: Annotated[
-        ImageCoding, typer.Option(help='How images are kept; raw and png are exact.')
+        ImageCoding, typer.Option(help='How images are kept in a bag; raw and png are exact.')
     ] = ImageCoding.raw,
+    as_json: terminal.Json = False,
 ) -> None:
-    """Convert a recording to a rosbag2 (mcap) with images, CameraInfo and what was measured.
+    """Convert a recording to a rosbag2 (mcap), or to a folder as of KITTI or TUM RGB-D.
 
     \b
     segfloor convert sequences/06 drive.mcap --images png
+    segfloor convert drive.mcap sequences/07 --truth /ground_truth
     """
     settings = options.configuration().stereo_camera
     source = open_source(settings)
+    layout = layout or layout_for(user_path(settings.input), out, source)
+    if layout is Layout.bag and truth is not None:
+        raise SettingsError('--truth goes with a folder: give --layout kitti or tum')
+    if layout is not Layout.bag and images is ImageCoding.jpeg:
+        raise SettingsError('--images jpeg goes with a bag; the images of a folder are PNG')
     terminal.print_sensors(source.sensors)
     has_depth = any(sensor.name == DEPTH and not sensor.used for sensor in source.sensors)
     depth = open_source(dataclasses.replace(settings, depth=True)) if has_depth else None
+    poses = None if truth is None else read_truth(truth, settings, source.calibration.left)
     with terminal.progress_bar('converting', source.frame_count) as progress:
-        pairs = write_bag(source, out, images, progress, depth)
+        if layout is Layout.bag:
+            pairs = write_bag(source, out, images, progress, depth)
+        else:
+            pairs = write_folder(source, out, layout, progress, depth, poses)
+    if as_json:
+        terminal.print_json({'pairs': pairs, 'size_mb': size_mb(out), 'out': str(out)})
     console.print(f'{pairs} pairs, {size_mb(out):.1f} MB: {out}')
 
 
@@ -292,8 +337,8 @@ def calibrate(
         str, typer.Option(help='ChArUco: of its markers, e.g. 4X4_50.')
     ] = DICTIONARY,
     out: Annotated[
-        Path | None, typer.Option('--out', help="Folder for what is written; else the pictures'.")
-    ] = None,
+        Path, typer.Option('--out', help='Folder for left.yaml, right.yaml and the report.')
+    ] = Path('calibration'),
     recording: Annotated[
         str | None,
         typer.Option(
@@ -317,6 +362,7 @@ def calibrate(
     ] = '',
     params: terminal.Params = None,
     assignments: terminal.Set = None,
+    as_json: terminal.Json = False,
 ) -> None:
     """Calibrate a stereo pair from pictures of a board: ROS calibration files and a report.
 
@@ -332,13 +378,15 @@ def calibrate(
         given = re.fullmatch('([1-9][0-9]{0,4})x([1-9][0-9]{0,4})', size)
         if size and given is None:
             raise SettingsError(f'--size {size}: expected e.g. 1280x720')
-        target = out or Path()
         made = convert_calibration(
-            other, None if given is None else (int(given[1]), int(given[2])), target
+            other, None if given is None else (int(given[1]), int(given[2])), out
         )
         camera = made.camera
+        if as_json:
+            facts = {'size_px': [camera.width, camera.height], 'baseline_m': camera.baseline_m}
+            return terminal.print_json({**facts, 'out': str(out)})
         words = f'{camera.width}x{camera.height}, baseline {camera.baseline_m:.4f} m'
-        return console.print(f'{target}: left.yaml, right.yaml: {words}', soft_wrap=True)
+        return console.print(f'{out}: left.yaml, right.yaml: {words}', soft_wrap=True)
     sides = re.fullmatch('([0-9]{1,2})x([0-9]{1,2})', board)
     if sides is None:
         raise SettingsError(f'--board {board}: expected e.g. 9x6')
@@ -347,7 +395,8 @@ def calibrate(
         pattern = Board(int(sides[1]), int(sides[2]), square_m, marker_m, dictionary)
     if recording is not None and folder is None:
         settings = terminal.configuration(params, assignments, recording).stereo_camera
-        _check_calibration(open_source(settings), pattern)
+        with terminal.json_alone(as_json):
+            _check_calibration(open_source(settings), pattern, as_json)
         return
     if folder is None or pattern is None or recording is not None:
         raise SettingsError('give a folder of pictures and --square, or --check RECORDING alone')
@@ -355,7 +404,26 @@ def calibrate(
         result = calibrate_folder(folder, pattern, out, progress)
     if result.left_out:
         printing.print_error(f'{folder}: left out: {result.left_out}')
-    _print_calibration(result, out or folder)
+    with terminal.json_alone(as_json):
+        _print_calibration(result, out)
+    if as_json:
+        terminal.print_json(_calibration_figures(result, out))
+
+
+def _calibration_figures(result: CalibrationResult, folder: Path) -> dict[str, Any]:
+    camera = result.calibration.camera
+    return {
+        'pairs_used': len(result.views),
+        'pairs_total': result.pairs_total,
+        'reprojection_px': result.rms_px,
+        'rows_px': result.epipolar_rms_px,
+        'seen_share': [result.seen_share(0), result.seen_share(1)],
+        'focal_px': camera.fx,
+        'baseline_m': camera.baseline_m,
+        'is_good': not result.advice,
+        'advice': result.advice,
+        'out': str(folder),
+    }
 
 
 def _print_calibration(result: CalibrationResult, folder: Path) -> None:
@@ -378,13 +446,16 @@ def _print_calibration(result: CalibrationResult, folder: Path) -> None:
         ('focal length, rectified', f'{camera.fx:.1f} px'),
         ('baseline', f'{camera.baseline_m:.4f} m'),
     ]
+    rows.append(('verdict', 'not good yet' if result.advice else 'good'))
     console.print(value_table('calibration', rows, str(folder)))
+    for line in result.advice or [NEXT]:
+        console.print(f'- {line}', soft_wrap=True)
     write_output(folder / PAGE, KINDS[PAGE], calibration_page(result, rows, folder))
     for name in (*FILES, PAGE):
         console.print(str(folder / name), soft_wrap=True)
 
 
-def _check_calibration(source: StereoSource, board: Board | None) -> None:
+def _check_calibration(source: StereoSource, board: Board | None, as_json: bool) -> None:
     """Print how the calibration of a recording fits it. Raises typer.Exit where it does not."""
     with terminal.progress_bar('checking', source.frame_count) as progress:
         found = check_recording(source, board, progress)
@@ -399,9 +470,11 @@ def _check_calibration(source: StereoSource, board: Board | None) -> None:
     if found.scale is not None and board is not None:
         true_m = board.diagonal_m
         length = f'{found.scale * true_m:.4f} m for {true_m:.4f} m, in {found.boards} pairs'
-    figures = [('pairs', str(found.pairs)), ('row error', rows), ('lag between the eyes', lag)]
+    figures = [('pairs', str(found.pairs)), ('row error', rows), ('lag between the cameras', lag)]
     figures += [] if board is None else [('first to last corner of the board', length)]
     console.print(value_table('calibration', figures, source.name))
+    if as_json:
+        terminal.print_json({**dataclasses.asdict(found), 'lag_ms': lags[0] if lags else None})
     for fault in found.faults:
         printing.print_error(fault.line())
     if found.faults:

@@ -244,6 +244,7 @@ class ReplaySession:
             input_faults=notes.input_faults,
             failed_frames=notes.failed_frames,
             failed_keyframes=len(notes.failed),
+            floor=None,  # the nodes do not publish the planes of keyframes
             interrupted=not is_whole,
             stages=notes.times.summary(),
             rss_mb=notes.memory.summary(),

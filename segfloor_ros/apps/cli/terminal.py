@@ -121,6 +121,16 @@ def print_json(document: Mapping[str, Any]) -> None:
     typer.echo(json.dumps(document, indent=2))
 
 
+@contextmanager
+def json_alone(as_json: bool) -> Iterator[None]:
+    """Print no tables and lines on standard output in the block, if figures come as JSON."""
+    was_quiet, console.quiet = console.quiet, as_json or console.quiet
+    try:
+        yield
+    finally:
+        console.quiet = was_quiet
+
+
 def end_if_interrupted(interrupt: Interrupt) -> None:
     """End the command where a signal came before there was a map."""
     if interrupt.status:
@@ -135,15 +145,16 @@ def finish_run(
     report: bool,
     remarks: Iterable[str],
     status: int = 0,
+    figures: RunSummary | None = None,
 ) -> None:
-    """Write the report if asked for, with the truth where the recording has one, and say where the
-    results are and what there is to say about them. status: to end with; 1 where it is 0 and
-    something could not be written.
+    """Write the report if asked for, with the truth where the recording has one, and print where
+    the results are and remarks. status: to end with; 1 where it is 0 and something could not be
+    written. figures: to print as JSON.
     """
     has_map = (folder.path / MAP).is_file()
     place = f'map: {folder.path / MAP}' if has_map else f'path: {folder.path / "trajectory.txt"}'
     console.print(place, soft_wrap=True)
-    problems = list(folder.problems)
+    problems, page = list(folder.problems), None
     if report:
         # Imported here: Matplotlib takes a second that other commands should not wait for.
         from segfloor_ros.apps.evaluation.report import write_report
@@ -151,12 +162,15 @@ def finish_run(
         recording = Path(input_name)
         truth = recording if (recording / 'map.yaml').is_file() else None
         try:
-            written = write_report(folder.path, truth)
-            console.print(f'report: {written}', soft_wrap=True)
+            page = str(write_report(folder.path, truth))
+            console.print(f'report: {page}', soft_wrap=True)
         except Exception as error:  # whatever it is, the results are there
             problems.append(f'there is no report: {str(error) or type(error).__name__}')
     for line in (*problems, *remarks):
         print_error(line)
+    if figures is not None:
+        places = {'out': str(folder.path), 'report': page}
+        print_json(dataclasses.asdict(figures) | places)
     if status and not problems:
         kept = f'; the whole result in {out} stays' if folder.path != out else ''
         print_error(f'cut short: what is mapped is in {folder.path}{kept}')
@@ -233,7 +247,7 @@ View = Annotated[
         help='Show what happens in a window of rerun, or write it to a file for that.',
     ),
 ]
-Json = Annotated[bool, typer.Option('--json', help='Print JSON in place of the table.')]
+Json = Annotated[bool, typer.Option('--json', help='Print figures as JSON, and no tables.')]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -284,12 +298,11 @@ class DriveOptions(InputOptions):
         typer.Option('--save-masks', help='Floor masks to save; all of them by run only.'),
     ] = SaveMasks.keyframes
     save_map: Annotated[
-        Path | None,
-        typer.Option('--save-map', help='File to save the whole map to, to go on with later.'),
+        Path | None, typer.Option('--save-map', help='File for the whole map, to continue later.')
     ] = None
-    load_map: Annotated[
-        Path | None, typer.Option('--load-map', help='Saved map to go on mapping in.')
-    ] = None
+    load_map: Annotated[Path | None, typer.Option('--load-map', help='Saved map to continue.')] = (
+        None
+    )
     localize: Annotated[
         bool,
         typer.Option(
@@ -304,6 +317,7 @@ class DriveOptions(InputOptions):
         typer.Option('--report', help='Write report.html: everything about the run on one page.'),
     ] = False
     view: View = None
+    as_json: Json = False
 
     @property
     def inputs(self) -> tuple[Path | str | None, ...]:
@@ -335,7 +349,8 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def with_all(**values: Any) -> None:
         given = {field.name for field in fields} & values.keys()
-        command(group(**{name: values.pop(name) for name in given}), **values)
+        with json_alone(values.get('as_json', False)):
+            command(group(**{name: values.pop(name) for name in given}), **values)
 
     keyword = inspect.Parameter.KEYWORD_ONLY
     all_of_them = [(f.name, f.default) for f in fields] + [(p.name, p.default) for p in own]
@@ -419,3 +434,4 @@ class ExploreOptions:
     depth: Depth = False
     set_values: SceneValues = None
     params: Params = None
+    as_json: Json = False

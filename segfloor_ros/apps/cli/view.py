@@ -6,9 +6,14 @@ Showing changes no result, and what would slow a drive down is left out.
 from __future__ import annotations
 
 import os
+import signal
+import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -58,8 +63,8 @@ from segfloor_ros.core.pipeline import Pipeline
 from segfloor_ros.core.plugins.semantics.outputs import UNLABELLED
 from segfloor_ros.nodes.configuration import resolve
 
-WEB_PORT = 9090
-"""Where the page for the browser is served, on this machine."""
+LOCALHOST, WEB_PORT = '127.0.0.1', 9090
+"""Where the page for the browser is served."""
 
 SHARE = 0.015
 """Of the time of a drive that showing its frames may take, and as much its keyframes."""
@@ -101,31 +106,71 @@ def open_view(
     stream = rerun.RecordingStream('segfloor')
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
-    is_served = False
     if target:
         if not target.endswith(SUFFIX):
             raise SettingsError(f'{target}: the file of a view ends in {SUFFIX}')
         check_output(Path(target), VIEW, inputs, '--view')
         stream.save(target)
-    elif os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'):
-        stream.spawn()
-    else:
-        address = stream.serve_grpc()
-        rerun.serve_web_viewer(web_port=WEB_PORT, connect_to=address)
-        page = f'http://localhost:{WEB_PORT}?url={quote(address, safe="")}'
-        console.print(f'view: {page}', highlight=False, soft_wrap=True)
-        is_served = True
+        with _flushed(stream):
+            yield View(Canvas(stream, rerun))
+        console.print(f'view: {target}, for the command rerun', highlight=False, soft_wrap=True)
+        return
+    with _viewer() as (server, address, is_page):
+        stream.connect_grpc(address)
+        with _flushed(stream):
+            yield View(Canvas(stream, rerun))
+        if is_page:
+            console.print('the view is there until Ctrl-C')
+            with suppress(KeyboardInterrupt):
+                server.wait()
+
+
+@contextmanager
+def _flushed(stream: Any) -> Iterator[None]:
     try:
-        yield View(Canvas(stream, rerun))
+        yield
     finally:
         stream.flush()
-    if target:
-        console.print(f'view: {target}, for the command rerun', highlight=False, soft_wrap=True)
-    if is_served:
-        console.print('the view is there until Ctrl-C')
-        with suppress(KeyboardInterrupt):
-            while True:
-                time.sleep(1.0)
+
+
+@contextmanager
+def _viewer() -> Iterator[tuple[subprocess.Popen[bytes], str, bool]]:
+    """Start the viewer of rerun: a window, or without a display a page for the browser, which ends
+    with the block. It listens on this machine alone; what rerun starts by itself listens on all
+    networks. Yields its process, where it takes a stream, and whether it is a page.
+    """
+    is_page = not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'))
+    words = [sys.executable, '-m', 'rerun_cli', '--bind', LOCALHOST]
+    port = _free_port()
+    words += ['--port', str(port)]
+    address = f'rerun+http://{LOCALHOST}:{port}/proxy'
+    if is_page:
+        web_port = _free_port(WEB_PORT)
+        words += ['--serve-web', '--web-viewer-port', str(web_port)]
+        page = f'http://{LOCALHOST}:{web_port}?url={quote(address, safe="")}'
+        console.print(f'view: {page}', highlight=False, soft_wrap=True)
+    # A session of its own: Ctrl-C ends the command, which ends the page; a window stays.
+    nowhere = subprocess.DEVNULL
+    server = subprocess.Popen(
+        words, stdin=nowhere, stdout=nowhere, stderr=nowhere, start_new_session=True
+    )
+    try:
+        yield server, address, is_page
+    finally:
+        if is_page:
+            with suppress(ProcessLookupError):
+                os.killpg(server.pid, signal.SIGTERM)  # rerun_cli starts the viewer as its child
+            server.wait()
+
+
+def _free_port(wanted: int = 0) -> int:
+    """Return a port of this machine that is free: the wanted one, or any where that is in use."""
+    with socket.socket() as probe:
+        try:
+            probe.bind((LOCALHOST, wanted))
+        except OSError:
+            probe.bind((LOCALHOST, 0))
+        return int(probe.getsockname()[1])
 
 
 class Canvas:
@@ -354,14 +399,37 @@ def show_recording(view: View, source: StereoSource) -> None:
             progress(done)
 
 
-def show_results(view: View, folder: Path, tab: str = '') -> None:
-    """Show what a run has left in a folder, behind a tab if it gets one, with the images of its
-    recording where that is still there. Raises InputError.
+@dataclass(frozen=True)
+class Results:
+    """What a run has left in a folder. trajectory, keyframes: times (N,) in s and T_map_base
+    (N, 4, 4).
+    """
+
+    folder: Path
+    summary: dict[str, Any]
+    trajectory: tuple[Array, Array]
+    keyframes: tuple[Array, Array]
+    cloud: LabelledPoints
+
+
+def read_results(folder: Path) -> Results:
+    """Read what a run has left in a folder. Raises InputError."""
+    return Results(
+        folder,
+        read_summary(folder / 'summary.json'),
+        read_trajectory(folder / 'trajectory.txt'),
+        read_trajectory(folder / 'keyframes.txt'),
+        read_ply(folder / 'labelled_cloud.ply'),
+    )
+
+
+def show_results(view: View, results: Results, tab: str = '') -> None:
+    """Show what a run has left, behind a tab if it gets one, with the images of its recording where
+    that is still there. Raises InputError.
     """
     view = View(view.canvas.below(tab)) if tab else view
-    summary = read_summary(folder / 'summary.json')
-    times_s, T_map_base = read_trajectory(folder / 'trajectory.txt')
-    keyframe_s, T_map_keyframe = read_trajectory(folder / 'keyframes.txt')
+    folder, summary = results.folder, results.summary
+    (times_s, T_map_base), (keyframe_s, T_map_keyframe) = results.trajectory, results.keyframes
     stamps_ns, keyframe_ns = (np.rint(1e9 * t).astype(np.int64) for t in (times_s, keyframe_s))
     first_ns = int(stamps_ns[0])
     figures = ('frames', 'tracked_frames', 'lost_intervals', 'keyframes', 'loops')
@@ -373,11 +441,10 @@ def show_results(view: View, folder: Path, tab: str = '') -> None:
     for count, at_s in enumerate(summary.get('loop_times_s', []), 1):
         view.loops(round(1e9 * at_s), count)
     view.path(first_ns, KeyframePath(keyframe_ns, T_map_keyframe))
-    cloud = read_ply(folder / 'labelled_cloud.ply')
-    view.cloud(first_ns, cloud)
+    view.cloud(first_ns, results.cloud)
     if (folder / POINT_LABELS).is_file():
         lines = read_text(folder / POINT_LABELS).splitlines()[1:]
-        view.classes(first_ns, cloud, [line.partition(',')[2] for line in lines])
+        view.classes(first_ns, results.cloud, [line.partition(',')[2] for line in lines])
     if (folder / SEMANTIC).is_file():
         view.canvas.picture(first_ns, CLASSES, read_picture(folder / SEMANTIC))
     if (folder / MAP).is_file():

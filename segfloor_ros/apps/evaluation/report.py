@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,11 +25,18 @@ from segfloor_ros.apps.evaluation.report_pictures import (
     read_run,
     v_disparity_picture,
 )
-from segfloor_ros.apps.results_folder import REPORT, SEMANTIC, STAGE_COLUMNS, stage_rows
+from segfloor_ros.apps.results_folder import (
+    REPORT,
+    SEMANTIC,
+    STAGE_COLUMNS,
+    memory_growth,
+    stage_rows,
+)
 from segfloor_ros.core.errors import os_errors
 from segfloor_ros.core.files.whole import read_bytes
 from segfloor_ros.core.files.writing import MARK, add_files
 from segfloor_ros.core.floor.pictures import MASK_COLOURS
+from segfloor_ros.core.floor.plane.plane import LOOKS, SURE, SWAY
 
 NO_TEXT = re.compile('[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]')
 """In names of files: what controls a terminal, and bytes that are not UTF-8."""
@@ -67,6 +75,7 @@ def calibration_page(
     seen = 'Corners in the left and the right image; orange: those of the worst pair'
     content = [
         _fact_row([(value, name) for name, value in figures]),
+        _section('What to do next', _list(result.advice) if result.advice else ''),
         _section('Left out', html.escape(result.left_out)),
         _section('Where the board was seen', _figure(coverage_picture(result), seen)),
         _section('Errors', _table(('pair', 'left px', 'right px', 'rows px', ''), rows, shares)),
@@ -106,7 +115,7 @@ def html_page(title: str, about: str, content: str, style: str = '') -> bytes:
 
 def _facts(data: ReportData) -> str:
     summary = data.summary
-    height_m = summary['camera_height_m']
+    height_m, floor = summary['camera_height_m'], summary.get('floor')
     tracked = 100 * summary['tracked_frames'] / max(1, summary['frames'])
     facts = [
         (f'{summary["frames"]}', 'frames'),
@@ -118,6 +127,8 @@ def _facts(data: ReportData) -> str:
         (f'{summary["frames_per_s"]:.1f}', 'frames per second'),
         *([] if height_m is None else [(f'{height_m:.3f} m', 'camera above the floor')]),
     ]
+    if floor is not None and floor['planes']:
+        facts.append((f'{floor["median_m"]:.3f} m', 'above it by single keyframes'))
     return _fact_row(facts) + _scores(data)
 
 
@@ -134,6 +145,7 @@ def advice(data: ReportData) -> list[str]:
         for fault in summary.get('input_faults', [])
     ]
     lines += summary.get('sensor_remarks', [])
+    lines += _doubts(summary)
     if summary['camera_height_m'] is None:
         lines.append(
             'the mount of the camera stayed unknown, so there is no map: let it see level floor at '
@@ -173,18 +185,67 @@ def advice(data: ReportData) -> list[str]:
     return lines or ['nothing: the figures are sound']
 
 
+def _doubts(summary: Mapping[str, Any]) -> list[str]:
+    """Return why the map may not be that of the whole drive, or not of the floor, each in a line.
+
+    A robot sways, and floor segmentation expects each frame within `SWAY` of the mount. So much may
+    the median of the heights above the planes of N keyframes differ, too, and where they are few by
+    three of its standard deviations, 1.25 `SWAY` / sqrt(N) for normal values.
+    """
+    lines = []
+    tracked, frames = summary['tracked_frames'], summary['frames']
+    if tracked < frames:
+        lines.append(
+            f'{tracked} of {frames} frames ({int(100 * tracked / frames)}%) are in the map: it '
+            'shows a part of the drive'
+        )
+    if summary.get('interrupted'):
+        lines.append('the drive was cut short: the map shows what came before')
+    height_m, floor = summary['camera_height_m'], summary.get('floor')
+    if height_m is None or floor is None:
+        return lines
+    planes, looks = floor['planes'], floor['looks']
+    if not looks:
+        return lines
+    if planes < min(LOOKS, looks):
+        return [
+            *lines,
+            f'{planes} of {looks} keyframes show the plane of the floor: too few to check the '
+            'height of the camera',
+        ]
+    sway_m, sigmas = SWAY[2] * height_m, SURE * 1.25 / math.sqrt(planes)
+    if abs(floor['median_m'] - height_m) > sway_m * max(1, sigmas):
+        lines.append(
+            f'the mount says that the camera is {height_m:.3f} m above the floor, single keyframes '
+            f'show {floor["median_m"]:.3f} m: measure it, and give stereo_slam.camera_height_m'
+        )
+    of_thirds = math.sqrt(2 * 3) * sigmas  # the difference of two medians of N / 3
+    if abs(floor['last_m'] - floor['first_m']) > sway_m * max(1, of_thirds):
+        lines.append(
+            f'the height of the camera above the floor changes from {floor["first_m"]:.3f} to '
+            f'{floor["last_m"]:.3f} m along the drive: is it fixed to the robot?'
+        )
+    return lines
+
+
 def _scores(data: ReportData) -> str:
     """Return the scores against the truth, where there is one."""
     if data.truth is None:
         return ''
     facts = _map_facts(score_map(data.grid, data.truth))
     if data.truth_folder is not None and (data.truth_folder / 'poses.txt').is_file():
-        # Imported here: evo is needed for this alone.
-        from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
-
-        path = score_trajectory(match_files(data.folder, data.truth_folder))
-        facts.append((f'{path.ate_rmse_m:.3f} m', f'path error over {path.path_length_m:.1f} m'))
+        facts.append(_path_fact(data.folder, data.truth_folder))
     return '<h2>Against the truth</h2>' + _fact_row(facts)
+
+
+def _path_fact(run: Path, truth: Path) -> tuple[str, str]:
+    # Imported here: evo is needed for this alone, and is an extra.
+    try:
+        from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
+    except ModuleNotFoundError:
+        return '–', "path error: pip install 'segfloor_ros[evaluate]'"
+    path = score_trajectory(match_files(run, truth))
+    return f'{path.ate_rmse_m:.3f} m', f'path error over {path.path_length_m:.1f} m'
 
 
 def _map_facts(score: MapScore) -> list[tuple[str, str]]:
@@ -257,14 +318,13 @@ def _table(names: tuple[str, ...], rows: list[list[str]], shares: list[float]) -
 
 def _memory(summary: dict[str, Any]) -> str:
     memory = summary.get('rss_mb', {})
-    words = (
-        ('start', 'MB at the start'),
-        ('peak', 'MB at most'),
-        ('slope_per_update', 'MB more per map update'),
-    )
-    facts = [(f'{memory[key]:.2f}', text) for key, text in words if key in memory]
-    if not facts:
+    if not memory:
         return ''
+    facts = [
+        (f'{memory["start"]:.0f} MB', 'at the start'),
+        (f'{memory["peak"]:.0f} MB', 'at most'),
+        (memory_growth(memory), 'more per map update'),
+    ]
     picture = memory_picture(memory)
     drawn = _figure(picture, 'Memory over the map updates') if picture else ''
     return _fact_row(facts) + drawn

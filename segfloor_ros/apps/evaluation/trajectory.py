@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,13 +39,16 @@ class TrajectoryScore:
     """ATE: RMSE and maximum of the distances after the best rigid alignment (no scale). RPE: RMSE
     of the motion over one metre (per metre where frames are further apart), NaN for shorter paths.
     end_error_m: distance at the last common pose when the first common poses are laid on each
-    other. tracked: share of the true poses that have an estimate.
+    other. tracked: share of the true poses that have an estimate. path_length_m,
+    estimate_length_m: of the true and the estimated path, the sum of its steps between the common
+    poses.
     """
 
     tracked: float
     matched: int
     frames: int
     path_length_m: float
+    estimate_length_m: float
     ate_rmse_m: float
     ate_max_m: float
     rpe_translation_m: float
@@ -201,6 +204,7 @@ def score_trajectory(matched: MatchedTrajectories) -> TrajectoryScore:
         matched=count,
         frames=matched.frames,
         path_length_m=_path_length(matched.truth),
+        estimate_length_m=_path_length(matched.estimate),
         ate_rmse_m=ate,
         ate_max_m=float(distances.max()),
         rpe_translation_m=_relative(metrics.PoseRelation.translation_part, matched),
@@ -288,29 +292,35 @@ def check_plot(path: Path, inputs: Iterable[Path | str | None] = ()) -> None:
     check_output(path, PLOTS[suffix], inputs, '--plot')
 
 
-def save_trajectory_plot(matched: MatchedTrajectories, path: Path) -> None:
-    """Write a plot of both paths from above and of the error over time. Raises InputError.
+def save_trajectory_plot(estimates: Mapping[str, MatchedTrajectories], path: Path) -> None:
+    """Write a plot of estimated paths, by name, on the true one from above, and of their errors
+    over time. Raises InputError.
 
     Paths are drawn on the plane in which the true path extends most, its first stretch to the
-    right.
+    right; the true path is the longest that an estimate has poses of.
     """
     # Imported here: Matplotlib takes a second that scores should not wait for.
     from matplotlib.figure import Figure
 
-    truth, aligned = matched.truth[:, :3, 3], matched.aligned[:, :3, 3]
+    longest = max(estimates.values(), key=lambda one: len(one.truth))
+    truth, start_s = longest.truth[:, :3, 3], min(m.times_s[0] for m in estimates.values())
     axes = plane_axes(truth)
-    true_xy, xy = (truth - truth[0]) @ axes.T, (aligned - truth[0]) @ axes.T
     figure = Figure(figsize=(11, 5), layout='constrained')
     above, error = figure.subplots(1, 2)
-    above.plot(*true_xy.T, 'k--', label='truth')
-    above.plot(*xy.T, color='tab:blue', label='estimate, aligned')
+    above.plot(*((truth - truth[0]) @ axes.T).T, 'k--', label='truth')
+    for place, (name, matched) in enumerate(estimates.items()):
+        is_alone = len(estimates) == 1
+        aligned = matched.aligned[:, :3, 3]
+        distances_cm = 100 * np.linalg.norm(aligned - matched.truth[:, :3, 3], axis=1)
+        label = 'estimate, aligned' if is_alone else name
+        colours = ('tab:blue', 'tab:red') if is_alone else (f'C{place}',) * 2
+        above.plot(*((aligned - truth[0]) @ axes.T).T, color=colours[0], label=label)
+        error.plot(matched.times_s - start_s, distances_cm, color=colours[1], label=label)
     above.plot(0, 0, 'ko', label='start')
     above.set(xlabel='ahead of the start [m]', ylabel='to its left [m]')
     above.set_aspect('equal', adjustable='datalim')
     above.legend()
     above.grid(alpha=0.3)
-    distances_cm = 100 * np.linalg.norm(aligned - truth, axis=1)
-    error.plot(matched.times_s - matched.times_s[0], distances_cm, color='tab:red')
     error.set(xlabel='time [s]', ylabel='position error [cm]', ylim=(0, None))
     error.grid(alpha=0.3)
     picture = io.BytesIO()

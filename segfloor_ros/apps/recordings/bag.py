@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
@@ -55,6 +56,8 @@ TF_TYPE, STATIC_TF = 'tf2_msgs/msg/TFMessage', '/tf_static'
 NOT_WHEELS = ('truth', 'visual', 'vio', 'slam', 'keyframe', 'lidar', 'laser', 'icp', 'gps', 'map')
 """Words in the names of odometry that is not the wheels'."""
 
+logger = logging.getLogger(__name__)
+
 GLOBAL_FRAMES = ('map', 'world', 'earth')
 """Frames that wheels know nothing of."""
 
@@ -67,14 +70,10 @@ def open_bag(path: Path, settings: StereoCameraSettings) -> StereoSource:
         types = {name: topic.msgtype for name, topic in bag.topics.items() if topic.num_messages}
         if not types:
             raise InputError(f'{path}: the bag is empty; record the image topics again')
-        depth = bag_topics.find_depth_topics(str(path), types, settings)
-        if depth is not None and (settings.depth or not bag_topics.has_pair(types, settings)):
-            topics = depth
+        topics, depth = _image_topics(path, types, settings)
+        if topics.right_is_depth:
             calibration = depth_calibration(_left_eye(path, bag, topics, settings))
         else:
-            topics = bag_topics.find_topics(
-                str(path), types, settings.left_image_topic, settings.right_image_topic
-            )
             given = given_calibration(settings, topics.is_rectified)
             calibration = given or _read_calibration(path, bag, topics)
         count = min(bag.topics[topic].num_messages for topic in (topics.left, topics.right))
@@ -97,6 +96,17 @@ def open_bag(path: Path, settings: StereoCameraSettings) -> StereoSource:
         bit_depth=settings.bit_depth,
         sensors=sensors,
     )
+
+
+def _image_topics(
+    path: Path, types: dict[str, str], settings: StereoCameraSettings
+) -> tuple[bag_topics.StereoTopics, bag_topics.StereoTopics | None]:
+    """Return the topics that are read, and those with depth images, where there are any."""
+    depth = bag_topics.find_depth_topics(str(path), types, settings)
+    if depth is not None and (settings.depth or not bag_topics.has_pair(types, settings)):
+        return depth, depth
+    left, right = settings.left_image_topic, settings.right_image_topic
+    return bag_topics.find_topics(str(path), types, left, right), depth
 
 
 def _entries(
@@ -275,6 +285,35 @@ def _fixed_transforms(bag: BagFile) -> FrameTree:
 def _wheel_poses(path: Path, topic: str) -> Iterator[WheelPose]:
     with _messages(path, topic) as messages:
         yield from (wheel_pose(message, f'{path}, {topic}') for message in messages)
+
+
+def odometry_path(
+    path: Path, topic: str, settings: StereoCameraSettings
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return stamps (N,) in ns, ascending, and poses (N, 4, 4) of an Odometry topic, and the frame
+    of the left images in that of its child (4, 4), by the fixed transforms of the bag; without any
+    both are taken for one. Raises InputError.
+    """
+    with open_bag_file(path) as bag:
+        types = {name: one.msgtype for name, one in bag.topics.items() if one.num_messages}
+        if types.get(topic) != ODOMETRY_TYPE:
+            found = sorted(name for name, kind in types.items() if kind == ODOMETRY_TYPE)
+            raise InputError(
+                f'{path}: no Odometry on {topic}; it has {", ".join(found) or "none at all"}'
+            )
+        child = str(bag.first(topic).child_frame_id).strip('/')
+        left = _frame_of(bag, _image_topics(path, types, settings)[0].left)
+        T_child_left = _fixed_transforms(bag).lookup(child, left)
+    if T_child_left is None:
+        logger.warning(
+            '%s: no fixed transform from %s to %s; the poses of %s are written as those of the '
+            'camera', path, child or 'the base', left, topic,
+        )  # fmt: skip
+    by_stamp = {one.stamp_ns: one.T_wheels_base for one in _wheel_poses(path, topic)}
+    stamps = sorted(ns for ns, pose in by_stamp.items() if np.isfinite(pose).all())
+    poses = np.array([by_stamp[ns] for ns in stamps]).reshape(-1, 4, 4)
+    T = np.eye(4) if T_child_left is None else T_child_left
+    return np.array(stamps, np.int64), poses, T
 
 
 def _imu_samples(path: Path, topic: str, T_left_imu: Array) -> Sequence[Measurement]:

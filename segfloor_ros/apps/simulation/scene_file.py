@@ -190,7 +190,8 @@ def open_scene(name: str, assignments: Iterable[str] = ()) -> Scene:
     path, scenes = Path(name), shipped()
     if not path.exists() and name not in scenes:
         raise InputError(f'{name}: no such scene or file{suggestion(name, list(scenes))}')
-    file = path if path.exists() else scenes[name]
+    is_shipped = name in scenes and not path.is_file()  # a folder of that name is what came of it
+    file = scenes[name] if is_shipped else path
     if file.is_dir():
         raise InputError(f'{name}: is a folder; name a scene file or a map YAML')
     if is_map_file(read_yaml(file, EXPECTED)):

@@ -19,7 +19,8 @@ from segfloor_ros.nodes.yaml_files import Key, MarkedYaml, read_marked_yaml
 
 RUN, REPLAY = 'run', 'replay'
 RECORDING, SCENE, RESULTS = SOURCES = ('input', 'simulate', 'results')
-SUITE_KEYS = ('name', 'defaults', 'recordings', 'about', 'published')
+SUITE_KEYS = ('name', 'defaults', 'recordings', 'about', 'published', 'published_measure')
+PUBLISHED_MEASURES = ('path_error_m', 'length_m')
 SHARED_KEYS = ('truth', 'reference_map', 'mode', 'rate', 'params', 'set', 'timeout_s', 'expect',
                'no_worse_by', 'no_map')  # fmt: skip
 RECORDING_KEYS = (*SOURCES, 'seed', 'scene', 'name', 'continue_from', 'published')
@@ -35,7 +36,7 @@ class Entry:
     `run`, or `replay` through the nodes at `rate`. truth, reference_map: paths or URLs; truth ''
     means the recording itself where it holds one. params: a parameter file, '' for none. slacks: by
     measure, for a baseline. continue_from: name of the recording whose map this one continues, ''
-    for none. no_map: the path alone is measured. published: path errors of others, by method.
+    for none. no_map: the path alone is measured. published: figures of others, by method.
     """
 
     name: str
@@ -59,13 +60,15 @@ class Entry:
 @dataclass(frozen=True)
 class Suite:
     """Recordings and what must hold for their maps. published: by method, where its figures are
-    from and how they were aligned. missing: names of recordings that are not there.
+    from and how they were aligned; published_measure: what they measure. missing: names of
+    recordings that are not there.
     """
 
     name: str
     entries: tuple[Entry, ...]
     published: Mapping[str, str] = field(default_factory=dict)
     missing: tuple[str, ...] = ()
+    published_measure: str = PUBLISHED_MEASURES[0]
 
 
 def read_suite(path: Path, data: Path | None = None) -> Suite:
@@ -76,6 +79,12 @@ def read_suite(path: Path, data: Path | None = None) -> Suite:
     document = read_marked_yaml(path, SettingsError)
     values = _mapping(document, (), document.values, SUITE_KEYS)
     published = values.get('published') or {}
+    measure = values.get('published_measure', PUBLISHED_MEASURES[0])
+    if measure not in PUBLISHED_MEASURES:
+        raise document.error(
+            ('published_measure',),
+            f'published_measure: {measure} is none of {", ".join(PUBLISHED_MEASURES)}',
+        )
     defaults = _mapping(document, ('defaults',), values.get('defaults') or {}, SHARED_KEYS)
     recordings = values.get('recordings')
     if not isinstance(recordings, list) or not recordings:
@@ -98,7 +107,8 @@ def read_suite(path: Path, data: Path | None = None) -> Suite:
             raise document.error(key, f'two recordings are called {doubled[0]}; give one a name')
     if not entries:
         raise SettingsError(f'{data}: has none of the recordings of {path}, e.g. {missing[0]}')
-    return Suite(str(values.get('name') or path.stem), tuple(entries), published, tuple(missing))
+    name = str(values.get('name') or path.stem)
+    return Suite(name, tuple(entries), published, tuple(missing), measure)
 
 
 def _continued(

@@ -51,6 +51,8 @@ MEASURES = {
     'lost_intervals': Measure('', LOWER, 'stretches of frames without a pose', 0.0),
     'path_error_m': Measure('m', LOWER, 'RMSE of the path after rigid alignment', 0.01),
     'end_error_m': Measure('m', LOWER, 'error of the last pose, seen from the first', 0.02),
+    'length_m': Measure('m', NEITHER, 'length of the path, between the poses with a true one'),
+    'true_length_m': Measure('m', NEITHER, 'length of the true path between the same poses'),
     'return_m': Measure('m', LOWER, 'from the last pose to the first'),
     'precision_percent': Measure('%', HIGHER, 'of road maps, map after opening', 0.5),
     'recall_percent': Measure('%', HIGHER, 'of road maps, map after opening', 1.0),
@@ -173,6 +175,8 @@ def _against_truth(
         path = score_trajectory(match_files(run, path_file))
         measured['path_error_m'] = path.ate_rmse_m
         measured['end_error_m'] = path.end_error_m
+        measured['length_m'] = path.estimate_length_m
+        measured['true_length_m'] = path.path_length_m
     if _share_masks(run / 'floor_masks', truth / 'floor'):
         floor = score_floor_folders(run, truth)
         measured['floor_precision_percent'] = 100 * floor.precision

@@ -95,7 +95,7 @@ def gather_evidence(
     if not settings.use_scan:
         nothing = np.zeros(0, np.float32)
         scan = dataclasses.replace(scan, ranges_m=nothing, obstacle_m=None)
-    floor, obstacles = _seen_points(points, features, T_map_base)
+    floor, obstacles = seen_points(points, features, T_map_base)
     if not settings.use_points:
         floor, obstacles = floor[:0], obstacles[:0]
     faces_m, hit_m = _faces(scan, settings), hit_range_m(scan, settings)
@@ -154,7 +154,7 @@ def ray_length_limit(lengths_m: Array) -> float:
     return float(lengths_m.mean()) + quarter + 1.5 * 2 * quarter
 
 
-def _seen_points(
+def seen_points(
     points: LabelledPoints, features: KeyframeFeatures, T_map_base: Array
 ) -> tuple[Array, Array]:
     """Return floor and obstacle points that the keyframe sees, (N, 2) each in its base frame."""

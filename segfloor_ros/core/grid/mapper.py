@@ -80,6 +80,7 @@ class OccupancyGridMapper:
 
     def __init__(self, settings: OccupancyGridSettings) -> None:
         self._settings = settings
+        self._gather = gather_evidence
         self._history = EvidenceHistory(EvidenceFolder(settings))
         self._stamp_ns = np.zeros(0, np.int64)
         self._set_back: tuple[NDArray[np.int64], EvidenceHistory] | None = None
@@ -107,7 +108,7 @@ class OccupancyGridMapper:
         at = int(np.searchsorted(path.stamp_ns, stamp_ns))
         if at == len(path.stamp_ns) or path.stamp_ns[at] != stamp_ns:
             raise MapError(f'keyframe {stamp_ns} ns is not in its own path of keyframes')
-        evidence = gather_evidence(points, features, path.T_map_base[at], scan, self._settings)
+        evidence = self._gather(points, features, path.T_map_base[at], scan, self._settings)
         self._history.extend([evidence], poses[at : at + 1])
         self._stamp_ns = np.append(self._stamp_ns, np.int64(stamp_ns))
 
@@ -161,6 +162,15 @@ class OccupancyGridMapper:
         for history in (before, latest):
             self._history.extend(history.evidence, history.poses)
         self._stamp_ns = np.concatenate([earlier, self._stamp_ns])
+
+
+def make_mapper(settings: OccupancyGridSettings) -> OccupancyGridMapper:
+    """Return the mapper that the settings ask for."""
+    if not settings.as_published:
+        return OccupancyGridMapper(settings)
+    from segfloor_ros.core.grid.as_published import PublishedMapper
+
+    return PublishedMapper(settings)
 
 
 def mark_standing(

@@ -150,6 +150,7 @@ class OccupancyGridSettings(StageSettings):
         True, 'Obstacle points mark cells, and rays to floor points mark free cells.'
     )
     use_scan: bool = setting(True, 'The floor scan marks free cells and what it ended at.')
+    as_published: bool = setting(False, 'Map points alone, in two binary layers, as published.')
     footprint_radius_m: float = setting(
         0.15,
         'The base has driven over the floor this far around it; 0 leaves it to what was seen.',

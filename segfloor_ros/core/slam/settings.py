@@ -52,6 +52,12 @@ class StereoSlamSettings(StageSettings):
     keyframe_max_frames: int = setting(
         30, 'A new keyframe is due after this many frames (condition A1).', within=(1, 1000)
     )
+    keyframe_novelty: float = setting(
+        1.0,
+        'Motion that makes a view new, 1 being 4 % of the distance of what is seen, or 3.4 deg; '
+        'smaller makes more keyframes.',
+        within=(0.01, 10.0),
+    )
 
     @property
     def has_mount(self) -> bool:

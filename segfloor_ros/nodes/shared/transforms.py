@@ -12,7 +12,7 @@ from geometry_msgs.msg import TransformStamped
 from segfloor_ros.core.contracts import FrameResult, Mount
 from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.nodes.messages.poses import transform_message
-from segfloor_ros.nodes.messages.topics import IMAGES, PATIENCE_S
+from segfloor_ros.nodes.messages.topics import FRESH_S, IMAGES, PATIENCE_S
 from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.inputs import LOOK_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
@@ -53,7 +53,7 @@ class Transforms:
                 'no tf: tf2_msgs is not installed; the mount of the camera comes from the '
                 'parameters camera_height_m, camera_pitch_rad and camera_roll_rad or is measured'
             )
-        node.inputs.every(LOOK_S, self._advance)
+        node.inputs.repeat(self._advance)
 
     def listener_count(self) -> int:
         """Return how many other nodes listen to tf."""
@@ -128,7 +128,8 @@ class Transforms:
         self._unsent_mount = stamp_ns, camera_frame, mount
         self._is_announced = True
 
-    def _advance(self) -> None:
+    def _advance(self) -> float:
+        """Follow what tf tells; returns in how many seconds to look again."""
         publishers = self._node.count_publishers('/tf') + self._node.count_publishers('/tf_static')
         if publishers > self._publishers and self._own.publish_tf:  # which may be rivals
             self._link.listen()
@@ -145,6 +146,7 @@ class Transforms:
             self._link.stop_listening()
         if self._is_fused:
             self._correct()
+        return FRESH_S if has_mount and not self._is_fused else LOOK_S
 
     def _broadcast_mount(self, stamp_ns: int, camera_frame: str, mount: Mount) -> None:
         """Where the camera's frame hangs on another one already, e.g. on the camera's body, that

@@ -1,5 +1,8 @@
 """`segfloor convert` and `segfloor calibrate` for real."""
 
+import json
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -27,6 +30,8 @@ def test_a_converted_recording_has_the_same_frames(tmp_path):
     done = segfloor('convert', folder, tmp_path / 'drive.mcap', '--images', 'png')
     assert done.returncode == 0, done.stderr
     assert '4 pairs' in done.stdout
+    done = segfloor('convert', folder, tmp_path / 'again.mcap', '--frames', 3, '--json')
+    assert json.loads(done.stdout)['pairs'] == 3
     source = open_source(StereoCameraSettings(input=str(tmp_path / 'drive.mcap')))
     for frame, original in zip(source.frames(), frames, strict=True):
         assert frame.stamp_ns == original.stamp_ns
@@ -83,6 +88,28 @@ def test_calibrate_solves_the_pictures_of_opencv(shared_data, tmp_path):
     calibration = read_calibration(tmp_path / 'left.yaml', tmp_path / 'right.yaml')
     # OpenCV's sample publishes fx = 534 px for these pictures.
     assert abs(calibration.left.K[0, 0] - 534) < 10
+    # The board is never in the right part of the right image.
+    assert re.search(r'verdict +│ not good yet', done.stdout)
+    assert re.search(r'the board covers 4\d% of the right image.* until it covers 80%', done.stdout)
+
+
+def test_calibrate_writes_beside_the_pictures_only_where_told_to(tmp_path, monkeypatch):
+    boards = write_boards(tmp_path / 'boards', 8)
+    before = sorted(boards.rglob('*'))
+    monkeypatch.chdir(tmp_path)
+    form = ('--square', SQUARE_M, '--board', 'x'.join(map(str, BOARD)))
+    done = segfloor('calibrate', boards, *form, '--json')
+    assert done.returncode == 0, done.stderr
+    assert sorted(boards.rglob('*')) == before
+    assert {path.name for path in (tmp_path / 'calibration').iterdir()} >= {
+        'left.yaml', 'right.yaml', 'calibration.html',
+    }  # fmt: skip
+    figures = json.loads(done.stdout)
+    assert (figures['pairs_used'], figures['pairs_total']) == (8, 8)
+    assert figures['is_good'] == (figures['advice'] == [])
+    left_share, right_share = figures['seen_share']
+    assert ('of the left image' in ' '.join(figures['advice'])) == (left_share < 0.8)
+    assert ('of the right image' in ' '.join(figures['advice'])) == (right_share < 0.8)
 
 
 def test_pictures_of_another_board_end_in_one_line(tmp_path):
@@ -117,7 +144,7 @@ def test_calibrate_refuses_a_board_in_no_form(tmp_path):
 def test_calibrate_checks_a_recording(tmp_path):
     boards = write_boards(tmp_path / 'boards', 11)
     form = ('--square', SQUARE_M, '--board', 'x'.join(map(str, BOARD)))
-    assert segfloor('calibrate', boards, *form).returncode == 0
+    assert segfloor('calibrate', boards, *form, '--out', boards).returncode == 0
     done = segfloor('calibrate', '--check', boards, *form)
     assert done.returncode == 0, done.stderr
     assert 'm for 0.2163 m, in 2 pairs' in done.stdout

@@ -11,8 +11,11 @@ import typer
 from command_line import segfloor
 from rich.text import Text
 
+from segfloor_ros.apps.cli.help_panels import ADVANCED, BASIC, lay_out
 from segfloor_ros.apps.cli.main import COMMANDS, program
 from segfloor_ros.apps.cli.terminal import params_file, shipped_params
+from segfloor_ros.apps.simulation.scene_file import open_scene, shipped
+from segfloor_ros.core.errors import InputError
 from segfloor_ros.nodes.configuration import resolve
 
 
@@ -35,6 +38,17 @@ def test_no_word_of_a_help_is_taken_for_markup(name):
         assert Text.from_markup(words).plain == words, parameter.name
 
 
+@pytest.mark.parametrize('name', SINGLE)
+def test_a_help_shows_eight_options_at_most_before_the_advanced_ones(name):
+    lay_out(SINGLE[name], name)
+    options = [p for p in SINGLE[name].params if p.opts[0].startswith('-')]
+    basic = {p.opts[0] for p in options if p.rich_help_panel is None}
+    assert len(basic) <= 8
+    if name in BASIC:
+        assert basic == {*BASIC[name].split()}
+        assert {p.rich_help_panel for p in options} == {None, ADVANCED}
+
+
 @pytest.mark.parametrize('name', COMMANDS)
 def test_a_command_is_described_in_the_words_of_its_own_help(name):
     own = ' '.join(ALL[name].help.partition('\n\n')[0].split())
@@ -50,6 +64,14 @@ def test_a_help_opens_with_examples_that_the_command_takes(name):
         command = next(SINGLE[n] for n in (words[0], ' '.join(words[:2])) if n in SINGLE)
         known = {option for p in command.params for option in p.opts}
         assert {word for word in words if word.startswith('--')} <= known, example
+
+
+def test_the_example_of_simulate_can_be_run_again_beside_what_came_of_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'corridor1').mkdir()
+    assert open_scene('corridor1') == open_scene(str(shipped()['corridor1']))
+    with pytest.raises(InputError, match='is a folder'):
+        open_scene('.')
 
 
 def test_scenes_are_listed_with_a_line_each():

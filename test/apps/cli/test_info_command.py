@@ -62,7 +62,7 @@ def test_the_tables_say_the_same(drive: Path) -> None:
     assert done.returncode == 0
     for words in ('KITTI odometry folder', '320x240, rectified', '90 x 74 deg', '0.1200 m'):
         assert words in done.stdout
-    assert done.stdout.endswith('- nothing to mend\n')
+    assert done.stdout.endswith('- nothing to fix\n')
 
 
 def test_a_part_of_a_recording_is_read(drive: Path) -> None:

@@ -235,11 +235,12 @@ def test_calibration_files_of_the_user_stay(tmp_path):
     pictures = write_boards(tmp_path / 'pictures', 2)
     (tmp_path / 'out').mkdir()
     (tmp_path / 'out' / 'notes.txt').write_text('mine')
-    for words, target in (([], pictures), (['--out', tmp_path / 'out'], tmp_path / 'out')):
+    for target in (pictures, tmp_path / 'out'):
         for name in ('left.yaml', 'right.yaml', 'calibration.html'):
             (target / name).write_text('mine')
             before = state_of(tmp_path)
-            assert_refused(['calibrate', str(pictures), '--square', '0.03', *map(str, words)])
+            words = ('calibrate', pictures, '--square', '0.03', '--out', target)
+            assert_refused([*map(str, words)])
             assert state_of(tmp_path) == before
             (target / name).unlink()
 

@@ -15,6 +15,7 @@ from stereo_room import MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.apps.evaluation.report import write_report
 from segfloor_ros.apps.map_files import load_map
+from segfloor_ros.apps.results_folder import floor_heights, memory_growth
 from segfloor_ros.core.files.results import read_map_file
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED
 from segfloor_ros.core.slam.settings import StereoSlamSettings
@@ -429,7 +430,29 @@ def test_a_report_on_a_cloud_that_cannot_be_read_ends_with_status_2(result, tmp_
         assert 'labelled_cloud.ply' in done.stderr
 
 
+def test_the_figures_of_a_run_are_printed_as_json_alone(recording, tmp_path):
+    done = segfloor('run', recording, '--out', tmp_path / 'out', '--no-map', '--json')
+    assert done.returncode == 0, done.stderr
+    printed = json.loads(done.stdout)
+    assert printed.pop('out') == str(tmp_path / 'out')
+    assert printed.pop('report') is None
+    assert printed == json.loads((tmp_path / 'out' / 'summary.json').read_text())
+
+
+@pytest.mark.parametrize(
+    ('slope', 'words'), [(-0.011, 'none'), (0.0002, 'none'), (0.0149, '0.015 MB')]
+)
+def test_memory_that_is_freed_is_no_growth(slope, words):
+    assert memory_growth({'slope_per_update': slope}) == words
+
+
 FAULT = {'fault': 'rows_apart', 'value': 3.2, 'unit': 'px', 'remedy': 'calibrate again'}
+
+
+def heights(median_m, first_m, last_m):
+    return {'planes': 60, 'looks': 60, 'median_m': median_m, 'first_m': first_m, 'last_m': last_m}
+
+
 SUBMAP = {'first_frame': 4, 'last_frame': 9, 'merged': False}
 
 
@@ -444,18 +467,57 @@ SUBMAP = {'first_frame': 4, 'last_frame': 9, 'merged': False}
         ({'blind_frames': 2}, '2 frames show too few features'),
         ({'frames_per_s': 4.0}, '4.0 frames per second are fewer than the 10.0 of the camera'),
         ({'sensor_remarks': ['imu: upside down']}, 'imu: upside down'),
+        ({'tracked_frames': 4}, f'4 of {FRAMES} frames (25%) are in the map'),
+        ({'interrupted': True}, 'the drive was cut short'),
+        ({'floor': heights(1.0, 1.0, 1.0)}, 'nothing: the figures are sound'),
+        # A robot sways by 4 %.
+        ({'floor': heights(1.03, 1.0, 1.03)}, 'nothing: the figures are sound'),
+        ({'floor': heights(1.05, 1.05, 1.05)}, 'the mount says that the camera is 1.000 m'),
+        # Of 9 planes the median errs by up to 5 %, and those of 3 differ by up to 12 %.
+        (
+            {'floor': heights(1.045, 0.95, 1.06) | {'planes': 9, 'looks': 9}},
+            'nothing: the figures are sound',
+        ),
+        ({'floor': heights(1.1, 1.1, 1.1)}, 'the mount says that the camera is 1.000 m above the'),
+        ({'floor': heights(1.0, 0.95, 1.05)}, 'the height of the camera above the floor changes'),
+        (
+            {'floor': heights(1.0, 1.0, 1.0) | {'planes': 2, 'looks': 30}},
+            '2 of 30 keyframes show the plane',
+        ),
+        ({'floor': {'planes': 0, 'looks': 2}}, '0 of 2 keyframes show the plane'),
+        ({'floor': {'planes': 0, 'looks': 0}}, 'nothing: the figures are sound'),
+        ({'tracked_frames': 1499, 'frames': 1500}, '1499 of 1500 frames (99%) are in the map'),
+        ({'floor': None}, 'nothing: the figures are sound'),
     ],
 )
 def test_a_report_says_what_to_do_next(result, tmp_path, figures, words):
     """Of a drive at 10 Hz."""
     run = tmp_path / 'run'
     shutil.copytree(result[0], run, ignore=shutil.ignore_patterns('*_masks', 'floor_debug'))
-    summary = json.loads((run / 'summary.json').read_text()) | {'frames_per_s': 20.0} | figures
+    usual = {'frames_per_s': 20.0, 'camera_height_m': 1.0, 'floor': heights(1.0, 1.0, 1.0)}
+    summary = json.loads((run / 'summary.json').read_text()) | usual | figures
     (run / 'summary.json').write_text(json.dumps(summary))
     page = write_report(run).read_text()
     (box,) = re.findall('<h2>What to do next</h2><ul class="next">(.*?)</ul>', page)
     assert box.startswith(f'<li>{words}')
     assert box.count('<li>') == 1
+
+
+def test_a_run_measures_the_height_of_the_camera_in_single_keyframes(result):
+    summary = json.loads((result[0] / 'summary.json').read_text())
+    floor = summary['floor']
+    assert 0 < floor['planes'] <= floor['looks'] == summary['keyframes']
+    for name in ('median_m', 'first_m', 'last_m'):
+        assert floor[name] == pytest.approx(MOUNT.height_m, rel=0.02)
+    assert f'{floor["median_m"]:.3f} m ({floor["planes"]} planes' in result[1].stdout
+
+
+def test_heights_of_a_drive_are_medians_of_all_and_of_its_ends():
+    heights_m = np.array([1.0, 1.0, 5.0, 2.0, 2.0, 2.0, 3.0, 3.0, 3.0])
+    assert floor_heights(heights_m, 12) == {
+        'planes': 9, 'looks': 12, 'median_m': 2.0, 'first_m': 1.0, 'last_m': 3.0,
+    }  # fmt: skip
+    assert floor_heights(heights_m[:0], 3) == {'planes': 0, 'looks': 3}
 
 
 def test_a_report_names_its_colours_and_the_length_of_the_path(result, tmp_path):

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -219,3 +223,39 @@ def test_without_rerun_one_line_says_how_to_install_it(recording, tmp_path, monk
 )
 def test_the_file_of_a_view_may_be_left_out(words, read):
     assert main.with_optional_values(words.split()) == read.split()
+
+
+def test_the_page_is_served_on_this_machine_alone_and_ends_with_the_command(recording) -> None:
+    pytest.importorskip('rerun_cli')
+    environment = {k: v for k, v in os.environ.items() if not k.endswith('DISPLAY')}
+    command = [sys.executable, '-m', 'segfloor_ros.apps.cli.main', 'view', str(recording)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    assert process.stdout is not None
+    try:
+        line = next(text for text in process.stdout if text.startswith('view: '))
+        port = int(re.fullmatch(r'view: http://127\.0\.0\.1:(\d+)\?url=.*\n', line)[1])
+        wait_until(lambda: port in listening())
+        assert listening()[port] == {'0100007F'}  # 127.0.0.1
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait(60)
+    wait_until(lambda: port not in listening())
+
+
+def listening() -> dict[int, set[str]]:
+    """Return the ports on which this machine listens, and the addresses of each (Linux)."""
+    found: dict[int, set[str]] = {}
+    for name in ('tcp', 'tcp6'):
+        for line in Path(f'/proc/net/{name}').read_text().splitlines()[1:]:
+            _, local, _, state = line.split()[:4]
+            if state == '0A':
+                address, _, port = local.partition(':')
+                found.setdefault(int(port, 16), set()).add(address)
+    return found
+
+
+def wait_until(is_so: Callable[[], bool], seconds: float = 60.0) -> None:
+    end_s = time.monotonic() + seconds
+    while not is_so():
+        assert time.monotonic() < end_s
+        time.sleep(0.1)

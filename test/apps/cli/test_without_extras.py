@@ -9,6 +9,7 @@ import pytest
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.apps.cli.main import COMMANDS
+from segfloor_ros.apps.cli.main import EXTRAS as PACKAGES
 
 EXTRAS = (
     'evo', 'junitparser', 'rosbags', 'mujoco', 'rerun', 'onnxruntime', 'distributed', 'fsspec',
@@ -66,19 +67,27 @@ def test_a_recording_is_mapped_without_extras(tmp_path) -> None:
     assert (tmp_path / 'out' / 'trajectory.txt').exists()
 
 
+@pytest.mark.slow
+def test_the_demo_runs_and_scores_the_map_without_extras(tmp_path):
+    done = without(tuple(PACKAGES), 'demo', '--lockstep', '--out', tmp_path / 'demo')
+    assert done.returncode == 0, done.stderr
+    assert "path: its error is measured after pip install 'segfloor_ros[evaluate]'" in done.stdout
+    assert 'segfloor_ros[evaluate]' in (tmp_path / 'demo' / 'report.html').read_text()
+
+
 @pytest.mark.parametrize(
-    ('words', 'package', 'extra'),
+    ('words', 'package', 'installed'),
     [
-        (('check', 'suite.yaml', '--out', 'out'), 'junitparser', 'cli'),
-        (('evaluate', 'trajectory', 'a.txt', 'b.txt'), 'evo', 'cli'),
-        (('view', 'room'), 'rerun', 'view'),
-        (('simulate', 'corridor1', '--out', 'out'), 'MuJoCo', 'sim'),
+        (('check', 'suite.yaml', '--out', 'out'), 'junitparser', 'junitparser'),
+        (('evaluate', 'trajectory', 'a.txt', 'b.txt'), 'evo', "'segfloor_ros[evaluate]'"),
+        (('view', 'room'), 'rerun', "'segfloor_ros[view]'"),
+        (('simulate', 'corridor1', '--out', 'out'), 'MuJoCo', "'segfloor_ros[sim]'"),
     ],
 )
-def test_a_command_says_in_one_line_which_extra_it_needs(words, package, extra, tmp_path) -> None:
+def test_a_command_names_in_one_line_what_to_install(words, package, installed, tmp_path) -> None:
     write_kitti(tmp_path / 'room', room_drive(2)[0])
     words = [str(tmp_path / word) if word in ('out', 'room') else word for word in words]
     done = without(EXTRAS, *words)
     assert done.returncode == 2
     assert done.stderr.startswith('segfloor: ') and done.stderr.count('\n') == 1
-    assert package in done.stderr and f"pip install 'segfloor_ros[{extra}]'" in done.stderr
+    assert package in done.stderr and f'pip install {installed}' in done.stderr

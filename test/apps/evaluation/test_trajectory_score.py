@@ -193,7 +193,7 @@ def test_trajectories_of_different_times_are_refused(tmp_path):
 def test_plot_is_a_picture(tmp_path):
     write_tum(tmp_path / 'a.txt', drive())
     matched = match_files(tmp_path / 'a.txt', tmp_path / 'a.txt')
-    save_trajectory_plot(matched, tmp_path / 'plot.png')
+    save_trajectory_plot({'path': matched}, tmp_path / 'plot.png')
     assert (tmp_path / 'plot.png').read_bytes().startswith(b'\x89PNG')
 
 
@@ -208,3 +208,46 @@ def test_plot_looks_from_above_along_the_first_stretch():
         [np.linspace([0, 0, 0], [0, 3, 0], 30), np.linspace([0, 3, 0], [-2, 3, 0], 20)]
     )
     np.testing.assert_allclose(plane_axes(corner), [[0, 1, 0], [-1, 0, 0]], atol=1e-9)
+
+
+def test_the_length_of_the_estimate_is_its_own(tmp_path):
+    longer = drive()
+    longer[:, 0, 3] *= 1.1
+    result = score(tmp_path, longer, drive())
+    assert result.path_length_m == pytest.approx(10.0)
+    assert result.estimate_length_m == pytest.approx(11.0)
+
+
+def test_several_estimates_stand_beside_each_other(tmp_path):
+    longer = drive()
+    longer[:, 0, 3] *= 1.1
+    truth = write_tum(tmp_path / 'truth.txt', drive())
+    (tmp_path / 'other').mkdir()
+    (tmp_path / 'one').mkdir()
+    names = ('one/plain.txt', 'one/longer.txt', 'other/plain.txt')
+    for name, poses in zip(names, (drive(), longer, drive()[:51]), strict=True):
+        write_tum(tmp_path / name, poses)
+    files = [tmp_path / name for name in names]
+    command = ('evaluate', 'trajectory', *files, truth)
+    plot = tmp_path / 'paths.png'
+    done = segfloor(*command, '--plot', plot)
+    assert done.returncode == 0, done.stderr
+    rows = [line.split('│')[1:] for line in done.stdout.splitlines() if line.startswith('│')]
+    rows = [[cell.strip() for cell in row] for row in rows]
+    assert [(row[0], row[2]) for row in rows] == [
+        ('one/plain', '10.00'),
+        ('one/longer', '11.00'),
+        ('other/plain', '5.00'),
+    ]
+    assert rows[1][1:4] == ['100.0', '11.00', '10.00']
+    assert rows[2][1] == '50.5'
+    assert plot.stat().st_size > 0
+    found = json.loads(segfloor(*command, '--json').stdout)
+    assert list(found) == ['one/plain', 'one/longer', 'other/plain']
+    assert found['one/longer']['estimate_length_m'] == pytest.approx(11.0)
+
+
+def test_a_truth_without_an_estimate_is_refused(tmp_path):
+    done = segfloor('evaluate', 'trajectory', write_tum(tmp_path / 'truth.txt', drive()))
+    assert done.returncode == 2
+    assert 'give one estimate or more, and at last the truth' in done.stderr

@@ -16,9 +16,11 @@ from camera_recordings import (
     Message,
     calibration,
     grey_pairs,
+    odometry_message,
     opened,
     sensor_yaml,
     stereo_messages,
+    transform_message,
     write_euroc,
     write_kitti,
     write_rosbag2,
@@ -26,7 +28,7 @@ from camera_recordings import (
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.apps.recordings import StereoSource
-from segfloor_ros.apps.recordings.bag import IMU_TYPE, ODOMETRY_TYPE, TF_TYPE
+from segfloor_ros.apps.recordings.bag import IMU_TYPE
 from segfloor_ros.core.camera.calibration import StereoCalibration
 from segfloor_ros.core.camera.recording import MeasurementLog
 from segfloor_ros.core.contracts import ImuSample, WheelPose
@@ -150,27 +152,6 @@ def test_a_file_beside_the_imu_of_a_folder_tells_where_it_is(tmp_path: Path) -> 
     assert sample.accel_m_s2[0] == pytest.approx(9.81)
 
 
-def odometry_message(topic: str, stamp_ns: int, x_m: float, frame: str = 'odom') -> Message:
-    def make(types: Any, header: Any) -> Any:
-        vector = types['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)
-        pose = types['geometry_msgs/msg/Pose'](
-            types['geometry_msgs/msg/Point'](x_m, 0.0, 0.0),
-            types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0),
-        )
-        stamped = header(stamp_ns)
-        stamped.frame_id = frame
-        return types[ODOMETRY_TYPE](
-            header=stamped,
-            child_frame_id='base_link',
-            pose=types['geometry_msgs/msg/PoseWithCovariance'](pose, np.zeros(36)),
-            twist=types['geometry_msgs/msg/TwistWithCovariance'](
-                types['geometry_msgs/msg/Twist'](vector, vector), np.zeros(36)
-            ),
-        )
-
-    return Message(topic, ODOMETRY_TYPE, stamp_ns, make)
-
-
 def imu_message(stamp_ns: int, accel: tuple[float, float, float], frame: str) -> Message:
     def make(types: Any, header: Any) -> Any:
         vector = types['geometry_msgs/msg/Vector3']
@@ -189,23 +170,8 @@ def imu_message(stamp_ns: int, accel: tuple[float, float, float], frame: str) ->
     return Message('/imu/data', IMU_TYPE, stamp_ns, make)
 
 
-def tf_message() -> Message:
-    """The IMU has the axes of a robot (x forward, z up), the camera's are optical."""
-
-    def make(types: Any, header: Any) -> Any:
-        stamped = header(0)
-        stamped.frame_id = 'camera'
-        transform = types['geometry_msgs/msg/TransformStamped'](
-            header=stamped,
-            child_frame_id='imu_link',
-            transform=types['geometry_msgs/msg/Transform'](
-                types['geometry_msgs/msg/Vector3'](0.0, 0.1, 0.0),
-                types['geometry_msgs/msg/Quaternion'](0.5, -0.5, 0.5, 0.5),
-            ),
-        )
-        return types[TF_TYPE]([transform])
-
-    return Message('/tf_static', TF_TYPE, 0, make)
+IMU_ON_CAMERA = transform_message('camera', 'imu_link', (0.0, 0.1, 0.0), (0.5, -0.5, 0.5, 0.5))
+"""The IMU has the axes of a robot (x forward, z up), the camera's are optical."""
 
 
 def bag(path: Path, *messages: Message) -> Path:
@@ -249,7 +215,7 @@ def test_an_imu_of_another_clock_is_refused_in_a_bag_too(tmp_path: Path, stamp_n
 
 
 def test_the_imu_of_a_bag_is_turned_by_tf(tmp_path: Path) -> None:
-    source = opened(bag(tmp_path, tf_message(), imu_message(100 * MS, (1, 2, 9.81), 'imu_link')))
+    source = opened(bag(tmp_path, IMU_ON_CAMERA, imu_message(100 * MS, (1, 2, 9.81), 'imu_link')))
     (sample,) = measured(source)
     # The pictures are distorted but not turned: x right is -y, y down is -z, z forward is x.
     np.testing.assert_allclose(sample.accel_m_s2, [-2, -9.81, 1], atol=1e-9)
@@ -263,7 +229,7 @@ def test_the_imu_of_a_bag_is_turned_by_tf_and_then_by_the_rectification(tmp_path
     turned = StereoCalibration(*(dataclasses.replace(e, R=R) for e in (eyes.left, eyes.right)))
     pictures = stereo_messages(grey_pairs(2), [100 * MS, 200 * MS], eyes=turned)
     imu = imu_message(100 * MS, (1, 2, 9.81), 'imu_link')
-    (sample,) = measured(opened(write_rosbag2(tmp_path / 'drive', [tf_message(), imu, *pictures])))
+    (sample,) = measured(opened(write_rosbag2(tmp_path / 'drive', [IMU_ON_CAMERA, imu, *pictures])))
     np.testing.assert_allclose(sample.accel_m_s2, [9.81, -2, 1], atol=1e-9)
     np.testing.assert_allclose(sample.gyro_rad_s, [0.3, -0.2, 0.1], atol=1e-9)
     np.testing.assert_allclose(sample.place_m, [-0.1, 0.0, 0.0], atol=1e-9)

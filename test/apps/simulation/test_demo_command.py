@@ -1,6 +1,7 @@
 """`segfloor demo` and `segfloor simulate` as a user runs them."""
 
 import base64
+import json
 import re
 from pathlib import Path
 
@@ -50,6 +51,14 @@ def test_the_demo_drive_is_small_and_complete():
     truth = load_truth(DRIVE)
     source = open_source(StereoCameraSettings(input=str(DRIVE / 'drive.mcap')))
     assert len(truth.base_poses) == source.frame_count == 273
+
+
+def test_a_scene_is_rendered_again_beside_the_folder_that_came_of_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        found = json.loads(simulate('corridor2', '--json'))
+        assert found['path_m'] == pytest.approx(0.6, abs=0.01)
+        assert len(list((tmp_path / 'corridor2' / 'image_0').iterdir())) == found['pairs']
 
 
 @pytest.mark.slow

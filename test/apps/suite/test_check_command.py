@@ -104,6 +104,17 @@ def test_what_became_worse_than_the_baseline_is_named(room, tmp_path):
     assert '(baseline ' in second.stderr
 
 
+def test_what_a_check_has_found_is_printed_as_json_alone(tmp_path):
+    text = 'recordings: [{{input: {empty}, name: empty, expect: {{tracked_percent: 100}}}}]'
+    done = check(suite_of(tmp_path, tmp_path, text), '--out', tmp_path / 'out', '--json')
+    assert done.returncode == 1
+    found = json.loads(done.stdout)
+    (recording,) = found.pop('recordings')
+    assert found == {'name': 'suite', 'holds': False}
+    assert (recording['name'], recording['state']) == ('empty', 'no map')
+    assert recording['wrong'][0].startswith('empty: ')
+
+
 def test_a_bad_suite_ends_with_status_2(room, tmp_path):
     path = suite_of(tmp_path, room, good_alone() + '    colour: red\n')
     done = check(path, '--out', tmp_path / 'out')
@@ -287,5 +298,14 @@ def test_paths_are_held_beside_published_ones_and_what_is_missing_is_said(room, 
     assert float(cells[3]) < 0.02
     assert cells[4:6] == ['', '']
     assert cells[-1] == '0.025'
-    assert 'a paper, table I' in done.stdout
+    assert 'error m of Other: a paper, table I' in done.stdout
     assert not (out / room.name / 'map.yaml').exists()
+    lengths = BENCHMARK.format(room=room) + 'published_measure: length_m\n'
+    suite.write_text(lengths.replace('0.025', '0.31'))
+    done = check(suite, '--out', out, '--data', room.parent)
+    assert done.returncode == 0, done.stderr
+    row = next(line for line in done.stdout.splitlines() if f'{room.name} ' in line and '│' in line)
+    ours, true, published = (cell.strip() for cell in row.strip('│').split('│')[-3:])
+    assert float(ours) == pytest.approx(float(true), rel=0.1)
+    assert published == '0.31'
+    assert 'length m of Other: a paper, table I' in done.stdout

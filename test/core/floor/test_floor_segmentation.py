@@ -358,6 +358,6 @@ def test_a_drop_close_ahead_does_not_take_the_floor_before_it(near, below):
     lower = dataclasses.replace(lower, is_floor=False)
     scene = Scene([floor_patch(far_m=0.8, contrast=near), lower, wall(4.0)])
     observation, floor, depth = segment(scene)
-    assert np.mean(observation.mask[floor] == FLOOR) > 0.88
+    assert np.mean(observation.mask[floor] == FLOOR) > 0.85
     fallen = ~floor & (points_of(scene, depth)[..., 2] < 0)
-    assert np.mean(observation.mask[fallen] == FLOOR) < 0.02
+    assert np.mean(observation.mask[fallen] == FLOOR) < 0.03

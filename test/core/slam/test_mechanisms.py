@@ -14,6 +14,8 @@ from segfloor_ros.core.slam.mapping.keyframe_mapping import find_duplicates
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.tracking.images import FeatureExtractor, Images
 from segfloor_ros.core.slam.tracking.map_tracking import LocalMap, Start, Tracker
+from segfloor_ros.core.slam.tracking.pose import PoseEstimate
+from segfloor_ros.core.twists import se3_exp
 
 SETTINGS = StereoSlamSettings(num_features=600)
 
@@ -43,6 +45,17 @@ def test_points_of_a_place_are_tracked_again_though_none_of_them_was_seen_lately
     np.testing.assert_array_equal(local.point_ids, np.arange(10))
 
 
+def test_smaller_novelty_makes_more_keyframes():
+    def keyframes(novelty):
+        settings = StereoSlamSettings(num_features=600, keyframe_novelty=novelty)
+        slam = equipped_slam(CAMERA, settings, MOUNT)
+        drive(slam, StereoRoom(), [planar_pose(0.02 * k, 0, 0) for k in range(14)])
+        return len(slam.map.keyframes)
+
+    few, usual, many = (keyframes(novelty) for novelty in (3.0, 1.0, 0.3))
+    assert few < usual < many
+
+
 @pytest.mark.parametrize('seed', [0, 1, 2])
 def test_patches_give_the_pose_better_than_corners(seed):
     room = StereoRoom(seed)
@@ -57,6 +70,26 @@ def test_patches_give_the_pose_better_than_corners(seed):
     truth = invert(MOUNT.T_base_left) @ moved @ MOUNT.T_base_left
     error = track.T_camera_world @ truth
     assert np.linalg.norm(error[:3, 3]) < 0.0015
+
+
+@pytest.mark.parametrize(('is_expected', 'measured'), [(True, 1), (False, 2)])
+def test_a_second_start_is_measured_only_where_the_first_was_not_expected(is_expected, measured):
+    slam, room = equipped_slam(CAMERA, SETTINGS, MOUNT), StereoRoom()
+    slam.process(room.frame(0, planar_pose(0, 0, 0)))
+    moved = planar_pose(0.06, 0.02, 0.05)
+    frame = room.frame(1, moved)
+    T_camera_world = invert(invert(MOUNT.T_base_left) @ moved @ MOUNT.T_base_left)
+    tracker, found = Tracker(slam.map), []
+    track_at = tracker.track_at
+    tracker.track_at = lambda *given, **named: found.append(track_at(*given, **named)) or found[-1]
+    at = T_camera_world if is_expected else se3_exp(np.full(6, 0.05)) @ T_camera_world
+    expected = PoseEstimate(at, np.zeros(0, bool), 1e-4 * np.eye(6), 1.0)
+    features = FeatureExtractor(SETTINGS).extract(frame.left)
+    ids = slam.map.points_of(np.array([0]))
+    starts = [Start(T_camera_world), Start(np.eye(4)), Start(np.eye(4))]
+    best = tracker.best(Images.of(frame, CAMERA), features, ids, starts, expected)
+    assert best.fits(PoseEstimate(T_camera_world, np.zeros(0, bool), 1e-6 * np.eye(6), 1.0))
+    assert len(found) == measured
 
 
 def test_what_a_keyframe_shows_anew_shares_its_error():

@@ -198,8 +198,7 @@ class Likelihood:
     where none are given."""
 
     def __init__(self, weights: Sequence[float] | Array | None = None) -> None:
-        chosen = list(WEIGHTS.values()) if weights is None else weights
-        self.weights = np.array(chosen, np.float32)
+        self.weights = np.array(list(WEIGHTS.values()) if weights is None else weights, np.float32)
 
     def weighed(self, mask: NDArray[np.uint8], seen: Seen) -> NDArray[np.uint8]:
         """Return a mask (R, W) without floor that is not likely, and with what surely is floor,

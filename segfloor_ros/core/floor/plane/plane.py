@@ -162,28 +162,29 @@ class PlaneFit:
 
 class Fixture:
     """What the planes of frames say of how the camera is fixed to its base. problem: in words, once
-    their heights vary by more than robots sway: a hand does not hold a camera like that.
+    their heights vary by more than robots sway: a hand does not hold a camera like that. planes:
+    pitch, roll and height (3,) of the camera above each of them, in order.
     """
 
     def __init__(self) -> None:
         self.problem: str | None = None
-        self._planes: list[Array] = []
+        self.planes: list[Array] = []
 
     def usual(self, mounted: Array) -> Array:
         """Return pitch, roll and height (1, 3) of the camera in most frames, where that is not how
         it is mounted (3,); (0, 3) where it is, and while few frames were seen.
         """
-        usual = np.median(self._planes or [mounted], axis=0)
+        usual = np.median(self.planes or [mounted], axis=0)
         off = np.abs(usual - mounted) / (1.0, 1.0, mounted[2])
-        is_other = len(self._planes) >= LOOKS and (off > SURE * np.array(SWAY)).any()
+        is_other = len(self.planes) >= LOOKS and (off > SURE * np.array(SWAY)).any()
         return usual[None] if is_other else np.zeros((0, 3))
 
     def note(self, fit: PlaneFit) -> None:
         """Take in the plane of a frame."""
         if not (fit.evidence > PROVED and fit.is_seen):
             return
-        self._planes.append(fit.angles_height)
-        heights_m = np.array(self._planes)[:, 2]
+        self.planes.append(fit.angles_height)
+        heights_m = np.array(self.planes)[:, 2]
         # One and two sigmas to either side of the median: a few wrong planes do not count.
         low, minus, middle, plus, high = np.percentile(heights_m, (2.5, 16, 50, 84, 97.5))
         if len(heights_m) >= LOOKS and plus - minus > 2 * SWAY[2] * middle:
@@ -232,33 +233,20 @@ def _seen(samples: Samples, planes: Array) -> tuple[Array, Array, NDArray[np.boo
     return error, expected, visible
 
 
-def scores(samples: Samples, angles_height: Array, drops: bool = False) -> Array:
+def scores(samples: Samples, angles_height: Array) -> Array:
     """Return how much of the samples' weight speaks for each plane (M, 3), less what speaks
     against it.
 
     The floor hides what is below it: a disparity clearly smaller than the plane's contradicts it.
-    drops: unless it is beyond what lies on the plane on average, where the floor may drop.
     """
     planes, total = plane_of(angles_height), np.zeros(len(angles_height))
-    parts = [samples.take(slice(i, i + _AT_ONCE)) for i in range(0, len(samples.weight), _AT_ONCE)]
-    mean_px = _mean_on(parts, planes) if drops else np.zeros(len(planes))
-    for part in parts:
+    for start in range(0, len(samples.weight), _AT_ONCE):
+        part = samples.take(slice(start, start + _AT_ONCE))
         error, limit, visible = _seen(part, planes)
-        below = (error < limit) & (part.disparity_px[:, None] - error >= mean_px)
+        below = np.float32(_VIOLATION_WEIGHT) * (error < limit)
         on = 1 - np.minimum((error / np.float32(SAME_PX)) ** 2, 1)
-        total += part.weight @ ((on - np.float32(_VIOLATION_WEIGHT) * below) * visible)
+        total += part.weight @ ((on - below) * visible)
     return total
-
-
-def _mean_on(parts: Sequence[Samples], planes: Array) -> Array:
-    """Return the mean disparity (M,) of what lies on each plane m (M, 3), of samples in parts."""
-    sums = np.zeros((2, len(planes)))
-    for part in parts:
-        error, _, visible = _seen(part, planes)
-        on = visible & (np.abs(error) < SAME_PX)
-        sums += part.weight @ on, (part.weight * part.disparity_px) @ on
-    mean: Array = sums[1] / np.maximum(sums[0], 1e-9)
-    return mean
 
 
 def shares(samples: Samples, angles_height: Array) -> tuple[float, float]:
@@ -419,18 +407,22 @@ class FramePrior:
         self.means = np.vstack([expected[0], expected])
         self.sigmas = np.vstack([still, *len(expected) * [SWAY]])
         self.sigmas[:, 2] *= self.means[:, 2]
-        self._is_fixed, self._most = is_fixed, SURE if is_fixed else math.inf
+        self._most = SURE if is_fixed else math.inf
 
     def log_posterior(self, samples: Samples, angles_height: Array) -> Array:
         """Return the logarithms of the likelihood times the density (M,) of planes (M, 3).
 
-        Where a fixed camera is as it is mounted the plane is known: what lies below it is a drop.
+        A fixed camera that is as it is mounted knows its plane: what lies below that, farther than
+        what lies on it on average, is a drop and no contradiction.
         """
         likelihood = np.repeat(scores(samples, angles_height)[:, None], len(self.means), axis=1)
-        if self._is_fixed:
-            likelihood[:, 0] = scores(samples, angles_height, drops=True)
-        best: Array = (_NATS * likelihood + self.log_density(angles_height)).max(axis=1)
-        return best
+        if self._most < math.inf:
+            error, limit, _ = (part[:, 0] for part in _seen(samples, plane_of(self.means[:1])))
+            floor_px, on = samples.disparity_px - error, np.abs(error) < SAME_PX
+            mean_px = floor_px[on].sum() / max(np.count_nonzero(on), 1)
+            kept = samples.take(np.flatnonzero((error >= limit) | (floor_px > mean_px)))
+            likelihood[:, 0] = scores(kept, angles_height)
+        return np.asarray((_NATS * likelihood + self.log_density(angles_height)).max(axis=1))
 
     def log_density(self, angles_height: Array) -> Array:
         """Return the logarithms of the density of each component (M, P + 1) at planes (M, 3)."""
@@ -454,11 +446,9 @@ def _likeliest(samples: Samples, prior: FramePrior) -> Array:
     raised[:, 2] = 1.0
     depth_m = samples.disparity_m / samples.disparity_px[on]
     raised[:, 2] = -depth_m * (plane_of(raised) * samples.rays[on]).sum(axis=1)
-    guesses = np.vstack([prior.means, drawn])
+    guesses, few = np.vstack([prior.means, drawn]), samples.every(int(_CORRELATED_SAMPLES))
     guesses = guesses[plausible(guesses)]
-    few = samples.every(int(_CORRELATED_SAMPLES))
-    best: Array = guesses[np.argmax(prior.log_posterior(few, guesses))]
-    return best
+    return np.asarray(guesses[np.argmax(prior.log_posterior(few, guesses))])
 
 
 def _refined(samples: Samples, guess: Array, prior: FramePrior) -> PlaneFit:

@@ -61,7 +61,7 @@ class FrontEnd:
         self, settings: StereoSlamSettings, sparse_map: SparseMap, body: BodySensors
     ) -> None:
         self.motion = CameraMotion(settings.max_speed_mps, body)
-        self.local = LocalMap(sparse_map, settings.keyframe_max_frames)
+        self.local = LocalMap(sparse_map, settings.keyframe_max_frames, settings.keyframe_novelty)
         self.follower = Follower(sparse_map)
         self.frame_to_frame = FrameToFrame(sparse_map.rig, settings.fast_threshold)
         self.tracker = Tracker(sparse_map)
@@ -226,6 +226,7 @@ class FrontEnd:
             yield Start(predictions[0], max(reach_px, USUAL_PX), is_sure=True)
         if followed is not None:
             yield Start(followed.T_camera_world)
+        yield Start(predictions[0], WIDE_PX)
         located = self.tracker.by_descriptors(features, self.local.point_ids)
         if located is not None:
             yield located
@@ -233,7 +234,6 @@ class FrontEnd:
         if stepped is not None:
             yield Start(stepped.T_camera_world)
         yield from (Start(T_camera_world) for T_camera_world in predictions)
-        yield Start(predictions[0], WIDE_PX)
 
     def _stepped(self, frame: StereoFrame, images: Images) -> Track | None:
         """Return the pose by the frame before alone: it shows no point of the map."""

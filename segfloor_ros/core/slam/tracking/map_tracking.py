@@ -95,9 +95,9 @@ class Tracker:
         expected: PoseEstimate | None,
     ) -> Track | None:
         """Return the pose of a frame with the most evidence, of those found from some starts, tried
-        in order until two lead to the same, or one that must be near is proven and is where the
-        camera was expected; its observations have the disparity offset. None where nothing is
-        proven.
+        in order until two lead to the same, the second one roughly where the first was expected, or
+        one that must be near is proven and is where the camera was expected; its observations have
+        the disparity offset. None where nothing is proven.
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
@@ -107,6 +107,8 @@ class Tracker:
             coarse = self._coarse(features, local_ids, start)
             if coarse is None:
                 continue
+            if best is not None and is_proof(most) and best.fits(expected) and best.fits(coarse):
+                break
             track = self.track_at(images, features, local_ids, coarse.T_camera_world)
             if track is None:
                 continue
@@ -276,12 +278,12 @@ def predict_points(
 
 class LocalMap:
     """Chooses points around a view (Mur-Artal et al., ORB-SLAM, 2015, section V-D). max_frames:
-    after which a keyframe is due.
+    after which a keyframe is due. new_view: novelty that makes a view new.
     """
 
-    def __init__(self, sparse_map: SparseMap, max_frames: int) -> None:
+    def __init__(self, sparse_map: SparseMap, max_frames: int, new_view: float = 1.0) -> None:
         self.point_ids: NDArray[np.int32] = np.zeros(0, np.int32)
-        self._max_frames = max_frames
+        self._max_frames, self._new_view = max_frames, new_view
         self._map = sparse_map
         self._depth_m = MIN_DEPTH_M
         self._asked: tuple[NDArray[np.int32], Covisible] | None = None
@@ -317,6 +319,7 @@ class LocalMap:
         reliable = known[self._map.observer_count[known] > 1]
         depth_m = self._median_depth(reliable if len(reliable) else known, track.T_camera_world)
         novelty = view_novelty(self._map, track.point_ids, track.T_camera_world, depth_m, covisible)
+        novelty /= self._new_view
         num_reliable = min(len(reliable), TRACKED_POINTS)
         found = len(track.point_ids)
         share = found / max(1, len(track.visible_ids))
