@@ -62,6 +62,7 @@ _NOTHING = 0.02
 _BLOCK, _NEAR, _WIDE = (COARSE_BLOCK_PX, COARSE_BLOCK_PX), (5, 5), (9, 9)
 """Columns and rows of the block that is matched, and of the windows over which pixels are averaged,
 and are counted."""
+_MOSTLY = 0.5
 _MOST_SIGMAS, _MOST_NATS = 12.0, 6.0
 """No feature says more: what is wrong is then as wrong as it can be."""
 _UNEVEN_PX = MEAN_NOISE * NOISE_PX, 1.4
@@ -217,8 +218,12 @@ class Likelihood:
         sure = judged & ~seen.lower & (log_ratio > _SURE)
         one_sided = seen.left_only & near_enough & ~judged
         if one_sided.any():
+            # What both cameras see there is a drop, if it is more than some matches by chance.
+            lower = seen.left_only & judged
+            shown = mean_of_known(known, (seen.texture > 1).astype(np.float32), _WIDE)[0]
+            by_chance = lower & (shown < _MOSTLY)
             values = np.where(seen.lower, np.float32(-_MOST_NATS), log_ratio)
-            carried = carry(values, known * judged, seen)
+            carried = carry(values, known * (judged & ~by_chance), seen)
             carried += every[-1] / 2
             unlikely |= one_sided & (carried < 0)
             sure |= one_sided & (carried > _SURE)
@@ -244,7 +249,7 @@ def carry(log_ratio: Picture, weight: Picture, seen: Seen) -> Picture:
     few = [cv2.blur(one, (3, 3))[::2, ::2] for one in (bounded * weight, weight, level)]
     parts = np.stack(few[:2])
     steps = [np.abs(np.diff(few[2], axis=axis, prepend=few[2].max())) for axis in (1, 0)]
-    own = np.median(np.minimum(*steps)[parts[1] > LEAST_KNOWN].tolist() or 1.0)
+    own = np.median(np.stack(steps)[:, parts[1] > LEAST_KNOWN].tolist() or 1.0)
     for step, axis in zip(steps, (2, 1), strict=True):
         kept = np.exp(-2 / _CARRY_PX - np.maximum(step / (2 * max(own, 1e-3)) - 1, 0))
         parts = _spread_along(parts, kept.astype(np.float32), axis)
