@@ -134,15 +134,18 @@ class FloorSegmentation:
         with measure('filling'):
             mask = self._fill(frame, judged, odd)
         with measure('likelihood'):
-            mask = drop_islands(self.likelihood.weighed(mask, _seen(frame, mask)))
+            seen = _seen(frame, mask, self._settings.step_height_m)
+            mask, climbed = self.likelihood.weighed(mask, seen)
+            driven = drop_islands(with_floor(mask, climbed))
             if not is_shown:
-                mask[mask == FLOOR] = NO_EVIDENCE
-            mask = pair.without_hidden(mask)
+                driven[driven == FLOOR] = NO_EVIDENCE
+            driven = pair.without_hidden(driven)
+            mask = without_floor(driven, climbed)
         with measure(DISPARITY_ABOVE):
             hanging_xy = self._overhead.positions(pair, view.mount)
         with measure('scan'):
             movable_xy = None if movable is None else self._positions(view, movable)
-            scan = self._scan(frame, judged, mask, hanging_xy, movable_xy)
+            scan = self._scan(frame, judged, driven, hanging_xy, movable_xy)
         if movable is not None:
             disparity = np.maximum(disparity, movable)
         return FloorObservation(
@@ -292,7 +295,7 @@ def _judged(frame: FrameEvidence, step_m: float) -> tuple[NDArray[np.uint8], NDA
     return mask, odd
 
 
-def _seen(frame: FrameEvidence, mask: NDArray[np.uint8]) -> Seen:
+def _seen(frame: FrameEvidence, mask: NDArray[np.uint8], step_m: float) -> Seen:
     """Return what the likelihood weighs. mask: (R, W), with what is floor so far."""
     pair, heights, compared, half = frame.pair, frame.heights, frame.compared, frame.view.half
     grey = cv2.blur(pair.left_rows, (BLOCK_PX, BLOCK_PX))[::STEP_PX, ::STEP_PX]
@@ -306,6 +309,7 @@ def _seen(frame: FrameEvidence, mask: NDArray[np.uint8]) -> Seen:
         left_only=columns < compared.floor_px,
         grey=grey.astype(np.float32),
         noise_grey=pair.noise_grey if pair.measured is None else 0.0,
+        step=step_m / frame.view.mount.height_m,
         mask=mask[half],
     )
 

@@ -41,7 +41,7 @@ from segfloor_ros.core.geometry import Array
 
 Picture = NDArray[np.float32]
 
-WEIGHTS = {'one': 0.76, 'above': -0.36, 'rises': 1.28, 'steep': -1.12, 'on': 2.05, 'look': 1.07}
+WEIGHTS = {'one': 0.66, 'above': -0.37, 'rises': 1.25, 'steep': -1.22, 'on': 1.47, 'look': 1.14}
 """By feature, made by `tools/fit_floor.py`.
 
 one: of a pixel that shows nothing. above: by how many sigmas it is higher than the floor around it.
@@ -50,6 +50,7 @@ that of what is upright. on: share of what is around it that is on that floor, l
 off. look: log likelihood of its brightness as of the floor.
 """
 
+_OF_HEIGHT = [list(WEIGHTS).index(name) for name in ('above', 'steep')]
 _SURE = math.log(0.95 / 0.05)
 """Log odds of what is surely floor; what is less likely than not is none."""
 _CARRY_PX = 20.0
@@ -69,8 +70,10 @@ _UNEVEN_PX = MEAN_NOISE * NOISE_PX, 1.4
 """How uneven the disparities of floors are, at least, as neighbours err together, and at most."""
 _RISE_SIGMA_PX = 0.7, 2.0
 """Error of the difference of two disparities, at least and at most."""
-_LEAST_LOOK = -4.0
-"""No brightness says more against a floor."""
+_BINS, _END = 2, 10
+"""Of the histogram of brightness, per sigma of the floor's; it ends at so many sigmas."""
+_NEITHER = 0.05
+"""Share of a floor, and of what stands, that may look like anything."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,8 @@ class Seen:
     a floor's disparity, per row of the image. texture: as many times of what is surely no noise.
     lower: bool, what lies deeper than a robot may drop. left_only: bool, what the right camera does
     not see if it is floor. grey: brightness, smoothed. noise_grey: of the images, 0 of depth that
-    is measured. mask: uint8, what is floor so far, and what is not.
+    is measured. step: what a robot climbs, over how high the camera is. mask: uint8, what is floor
+    so far, and what is not.
     """
 
     floor_px: Picture
@@ -92,6 +96,7 @@ class Seen:
     left_only: NDArray[np.bool_]
     grey: Picture
     noise_grey: float
+    step: float
     mask: NDArray[np.uint8]
 
     @property
@@ -113,19 +118,18 @@ def known_weight(seen: Seen) -> Picture:
     return weight * (np.float32(NOISE_PX) / np.sqrt(np.float32(NOISE_PX**2) + variance))
 
 
-def features(seen: Seen, weight: Picture) -> Picture:
-    """Return the features (F, h, w) of all pixels, in the order of `WEIGHTS`. weight: as of
-    `known_weight`.
+def features(seen: Seen, weight: Picture) -> tuple[Picture, NDArray[np.bool_]]:
+    """Return the features (F, h, w) of all pixels, in the order of `WEIGHTS`, and what is no higher
+    than a robot climbs (h, w). weight: as of `known_weight`.
     """
     known = (seen.disparity_px > 0).astype(np.float32)
-    height, mostly_on = _height(seen, weight)
+    height, mostly_on, is_low = _height(seen, weight)
     rises = _rise(seen, weight, known)
     # What is as level as a floor is none where it is higher, and what stands on it is higher.
     is_level = np.exp(-(height**2) / 2)
     rises *= np.where(rises > 0, is_level, (1 - is_level) * (height > 0))
     positive = (np.maximum(values, 0) for values in (height, rises, -rises, mostly_on))
-    look = _look(seen.grey, seen.is_floor)
-    return np.stack([np.ones_like(known), *positive, look])
+    return np.stack([np.ones_like(known), *positive, _look(seen)]), is_low
 
 
 def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, float]) -> np.float32:
@@ -137,7 +141,7 @@ def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, floa
     return np.float32(np.clip(spread, *bounds))
 
 
-def _height(seen: Seen, weight: Picture) -> tuple[Picture, Picture]:
+def _height(seen: Seen, weight: Picture) -> tuple[Picture, Picture, NDArray[np.bool_]]:
     """Return how high blocks of pixels are above the floor around them, in sigmas, and which share
     around each is on it, less that which is off it.
 
@@ -160,9 +164,10 @@ def _height(seen: Seen, weight: Picture) -> tuple[Picture, Picture]:
         sigma = float(_spread(gap, even, _UNEVEN_PX))
         lowest = -SIGMAS * sigma
     height = np.clip(gap / np.float32(sigma), -_MOST_SIGMAS, _MOST_SIGMAS)
+    is_low = gap < np.float32(seen.step) * (seen.floor_px + floor)
     on_off = np.where(np.abs(height) < SIGMAS, weight, -weight)
     mostly_on = mean_of_known(on_off, known, _WIDE)[0]
-    return height * np.minimum(share / np.float32(LEAST_KNOWN), 1), mostly_on
+    return height * np.minimum(share / np.float32(LEAST_KNOWN), 1), mostly_on, is_low
 
 
 def _rise(seen: Seen, weight: Picture, known: Picture) -> Picture:
@@ -185,12 +190,20 @@ def _rise(seen: Seen, weight: Picture, known: Picture) -> Picture:
     return mean_of_known(ratio, known, _NEAR)[0]
 
 
-def _look(grey: Picture, is_floor: NDArray[np.bool_]) -> Picture:
-    """Return the log likelihood of the brightness of each pixel as of the floor, 1 at its mean; 0
-    where no floor is known.
+def _look(seen: Seen) -> Picture:
+    """Return the log ratio of how often the brightness of each pixel is seen of the floor and of
+    what stands on it; 0 where no floor is known.
     """
-    squares = sigmas_off_floor(grey, is_floor, STEP_PX) ** 2
-    look: Picture = np.maximum(1 - squares / 2, np.float32(_LEAST_LOOK)) * is_floor.any()
+    bins = sigmas_off_floor(seen.grey, seen.is_floor, STEP_PX) * _BINS
+    bins = np.clip(bins + (_END * _BINS + 0.5), 0, 2 * _END * _BINS).astype(np.intp)
+    number = 2 * _END * _BINS + 1
+    logs = []
+    for some in (seen.is_floor, seen.mask == NOT_FLOOR):
+        often = np.bincount(bins[some], minlength=number) / max(1, np.count_nonzero(some))
+        often = np.convolve(often, (0.25, 0.5, 0.25), 'same')
+        logs.append(np.log((1 - _NEITHER) * often + _NEITHER / number))
+    ratio = (logs[0] - logs[1]).astype(np.float32)
+    look: Picture = np.clip(ratio, -_MOST_NATS, _MOST_NATS)[bins] * np.float32(seen.is_floor.any())
     return look
 
 
@@ -201,20 +214,30 @@ class Likelihood:
     def __init__(self, weights: Sequence[float] | Array | None = None) -> None:
         self.weights = np.array(list(WEIGHTS.values()) if weights is None else weights, np.float32)
 
-    def weighed(self, mask: NDArray[np.uint8], seen: Seen) -> NDArray[np.uint8]:
+    def weighed(
+        self, mask: NDArray[np.uint8], seen: Seen
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Return a mask (R, W) without floor that is not likely, and with what surely is floor,
-        where that is measured, or carried to what only the left camera sees. What lies too low for
-        a robot is a drop, or what a floor mirrors, and no floor however it looks.
+        where that is measured, or carried to what only the left camera sees; and what was floor
+        (R, W) and is none only as it is higher, though no higher than a robot climbs. What lies too
+        low for a robot is a drop, or what a floor mirrors, and no floor however it looks.
         """
         known = known_weight(seen)
-        every = features(seen, known)
+        every, is_low = features(seen, known)
         log_ratio = np.tensordot(self.weights, every, 1)
         near_enough = seen.floor_px > LEAST_FLOOR_PX
         judged = (known > LEAST_KNOWN) & near_enough
         unlikely = judged & (log_ratio < 0)
+        of_height = sum(self.weights[i] * every[i] for i in _OF_HEIGHT)
+        climbed = unlikely & is_low & (log_ratio > of_height)
         # At the border of a thing the block that is matched holds both, and its foot is no higher.
-        is_higher = unlikely & (every[1] > SIGMAS)
-        unlikely |= cv2.dilate(is_higher.view(np.uint8), np.ones(_BLOCK, np.uint8)) > 0
+        is_higher = judged & (log_ratio < -_SURE) & (every[1] > SIGMAS)
+        borders = [
+            cv2.dilate(part.view(np.uint8), np.ones(_BLOCK, np.uint8)) > 0
+            for part in (is_higher, is_higher & ~climbed)
+        ]
+        climbed = (climbed | borders[0]) & ~(unlikely & ~climbed) & ~borders[1]
+        unlikely |= borders[0]
         sure = judged & ~seen.lower & (log_ratio > _SURE)
         one_sided = seen.left_only & near_enough & ~judged
         if one_sided.any():
@@ -228,7 +251,9 @@ class Likelihood:
             unlikely |= one_sided & (carried < 0)
             sure |= one_sided & (carried > _SURE)
         sure &= ~unlikely
-        return with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))
+        climbed = enlarged(climbed, mask) & (mask == FLOOR)
+        found = with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))
+        return found, climbed
 
 
 def carry(log_ratio: Picture, weight: Picture, seen: Seen) -> Picture:
