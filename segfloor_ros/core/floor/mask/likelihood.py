@@ -41,7 +41,7 @@ from segfloor_ros.core.geometry import Array
 
 Picture = NDArray[np.float32]
 
-WEIGHTS = {'one': 0.66, 'above': -0.37, 'rises': 1.25, 'steep': -1.22, 'on': 1.47, 'look': 1.14}
+WEIGHTS = {'one': 0.89, 'above': -0.37, 'rises': 1.44, 'steep': -1.34, 'on': 1.43, 'look': 1.31}
 """By feature, made by `tools/fit_floor.py`.
 
 one: of a pixel that shows nothing. above: by how many sigmas it is higher than the floor around it.
@@ -63,17 +63,19 @@ _NOTHING = 0.02
 _BLOCK, _NEAR, _WIDE = (COARSE_BLOCK_PX, COARSE_BLOCK_PX), (5, 5), (9, 9)
 """Columns and rows of the block that is matched, and of the windows over which pixels are averaged,
 and are counted."""
-_MOSTLY = 0.5
 _MOST_SIGMAS, _MOST_NATS = 12.0, 6.0
 """No feature says more: what is wrong is then as wrong as it can be."""
+_DENSE = 0.5
+"""Ground is matched more densely than this, and what only one camera sees less."""
 _UNEVEN_PX = MEAN_NOISE * NOISE_PX, 1.4
 """How uneven the disparities of floors are, at least, as neighbours err together, and at most."""
 _RISE_SIGMA_PX = 0.7, 2.0
 """Error of the difference of two disparities, at least and at most."""
 _BINS, _END = 2, 10
 """Of the histogram of brightness, per sigma of the floor's; it ends at so many sigmas."""
-_NEITHER = 0.05
-"""Share of a floor, and of what stands, that may look like anything."""
+_FOREIGN, _UNSEEN = 0.05, 0.2
+"""Share of a floor that may look like anything; of what stands, like anything or like the floor, as
+not all of it is known."""
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,8 @@ def known_weight(seen: Seen) -> Picture:
     """
     weight: Picture = np.clip(2 * seen.texture - 1, 0, 1) * (seen.disparity_px > 0)
     slope = cv2.Sobel(seen.grey, cv2.CV_32F, 1, 0, ksize=1, scale=1 / (2 * STEP_PX))
-    pixels = _NEAR[0] * _NEAR[1]
-    power = cv2.boxFilter(slope * slope, -1, _NEAR, normalize=False)
+    pixels = _BLOCK[0] * _BLOCK[1]
+    power = cv2.boxFilter(slope * slope, -1, _BLOCK, normalize=False)
     power -= np.float32(pixels * NOISE_SLOPE * seen.noise_grey**2)
     variance = np.float32(2 * seen.noise_grey**2) / np.maximum(power, np.float32(1e-3))
     return weight * (np.float32(NOISE_PX) / np.sqrt(np.float32(NOISE_PX**2) + variance))
@@ -153,7 +155,10 @@ def _height(seen: Seen, weight: Picture) -> tuple[Picture, Picture, NDArray[np.b
     most_px = _MOST_SIGMAS * SAME_PX
     above = np.clip(seen.disparity_px - seen.floor_px, -most_px, most_px) * known
     share = cv2.blur(weight, _BLOCK)
-    mean = cv2.blur(weight * above, _BLOCK) / np.maximum(share, np.float32(_NOTHING))
+    # Each counts by the inverse of its variance.
+    squares = weight * weight
+    mean = cv2.blur(squares * above, _BLOCK)
+    mean /= np.maximum(cv2.blur(squares, _BLOCK), np.float32(1e-6))
     floor, sigma, lowest = np.zeros_like(above), NOISE_PX, -2 * most_px
     for _ in range(_ROUNDS):
         gap = mean - floor
@@ -197,14 +202,23 @@ def _look(seen: Seen) -> Picture:
     bins = sigmas_off_floor(seen.grey, seen.is_floor, STEP_PX) * _BINS
     bins = np.clip(bins + (_END * _BINS + 0.5), 0, 2 * _END * _BINS).astype(np.intp)
     number = 2 * _END * _BINS + 1
-    logs = []
-    for some in (seen.is_floor, seen.mask == NOT_FLOOR):
-        often = np.bincount(bins[some], minlength=number) / max(1, np.count_nonzero(some))
-        often = np.convolve(often, (0.25, 0.5, 0.25), 'same')
-        logs.append(np.log((1 - _NEITHER) * often + _NEITHER / number))
-    ratio = (logs[0] - logs[1]).astype(np.float32)
+    prior, found = np.full(number, 1 / number), []
+    for some, other in ((seen.is_floor, _FOREIGN), (seen.mask == NOT_FLOOR, _UNSEEN)):
+        counts = np.convolve(np.bincount(bins[some], minlength=number), (0.25, 0.5, 0.25), 'same')
+        # The fewer are seen the more counts what is known before.
+        share = (1 - other) / (counts.sum() + number)
+        found.append(share * (counts + number * prior) + other * prior)
+        prior = (prior + found[0]) / 2
+    ratio = np.log(found[0] / found[1]).astype(np.float32)
     look: Picture = np.clip(ratio, -_MOST_NATS, _MOST_NATS)[bins] * np.float32(seen.is_floor.any())
     return look
+
+
+def _with_border(part: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return a part of the picture with its border: there the block that is matched holds both, and
+    the foot of a thing is no higher than the floor.
+    """
+    return cv2.dilate(part.view(np.uint8), np.ones(_BLOCK, np.uint8)) > 0
 
 
 class Likelihood:
@@ -228,25 +242,20 @@ class Likelihood:
         near_enough = seen.floor_px > LEAST_FLOOR_PX
         judged = (known > LEAST_KNOWN) & near_enough
         unlikely = judged & (log_ratio < 0)
-        of_height = sum(self.weights[i] * every[i] for i in _OF_HEIGHT)
+        of_height = np.tensordot(self.weights[_OF_HEIGHT], every[_OF_HEIGHT], 1)
         climbed = unlikely & is_low & (log_ratio > of_height)
-        # At the border of a thing the block that is matched holds both, and its foot is no higher.
         is_higher = judged & (log_ratio < -_SURE) & (every[1] > SIGMAS)
-        borders = [
-            cv2.dilate(part.view(np.uint8), np.ones(_BLOCK, np.uint8)) > 0
-            for part in (is_higher, is_higher & ~climbed)
-        ]
-        climbed = (climbed | borders[0]) & ~(unlikely & ~climbed) & ~borders[1]
-        unlikely |= borders[0]
+        blocked = (unlikely & ~climbed) | _with_border(is_higher & ~climbed)
+        unlikely |= _with_border(is_higher)
+        climbed = unlikely & ~blocked
         sure = judged & ~seen.lower & (log_ratio > _SURE)
         one_sided = seen.left_only & near_enough & ~judged
         if one_sided.any():
             # What both cameras see there is a drop, if it is more than some matches by chance.
-            lower = seen.left_only & judged
             shown = mean_of_known(known, (seen.texture > 1).astype(np.float32), _WIDE)[0]
-            by_chance = lower & (shown < _MOSTLY)
+            counts = judged & ~(seen.left_only & (shown < _DENSE))
             values = np.where(seen.lower, np.float32(-_MOST_NATS), log_ratio)
-            carried = carry(values, known * (judged & ~by_chance), seen)
+            carried = carry(values, known * counts, seen)
             carried += every[-1] / 2
             unlikely |= one_sided & (carried < 0)
             sure |= one_sided & (carried > _SURE)
@@ -274,7 +283,7 @@ def carry(log_ratio: Picture, weight: Picture, seen: Seen) -> Picture:
     few = [cv2.blur(one, (3, 3))[::2, ::2] for one in (bounded * weight, weight, level)]
     parts = np.stack(few[:2])
     steps = [np.abs(np.diff(few[2], axis=axis, prepend=few[2].max())) for axis in (1, 0)]
-    own = np.median(np.stack(steps)[:, parts[1] > LEAST_KNOWN].tolist() or 1.0)
+    own = np.median(np.minimum(*steps)[parts[0] > LEAST_KNOWN].tolist() or 1.0)
     for step, axis in zip(steps, (2, 1), strict=True):
         kept = np.exp(-2 / _CARRY_PX - np.maximum(step / (2 * max(own, 1e-3)) - 1, 0))
         parts = _spread_along(parts, kept.astype(np.float32), axis)
