@@ -130,7 +130,7 @@ class FloorSegmentation:
             compared = compare(view, profile, pair, below, heights)
             frame = FrameEvidence(view, profile, pair, below, heights, compared)
         with measure('evidence'):
-            judged, odd = _judged(frame, self._settings.step_height_m)
+            judged, odd = _judged(frame)
         with measure('filling'):
             mask = self._fill(frame, judged, odd)
         with measure('likelihood'):
@@ -222,18 +222,15 @@ class FloorSegmentation:
         self, frame: FrameEvidence, judged: NDArray[np.uint8], looks_odd: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
         """Return the mask with floor where this pair of images alone cannot tell: where it looks
-        like floor. The more floor is known the better is known how it looks, so this is done twice,
-        and what then does not look like it is floor only if it was measured. Nor does it contradict
-        a network that was right so far.
+        like floor. The more floor is known the more goes on, so this is done twice. Nor does it
+        contradict a network that was right so far.
         """
         view, pair, consistent = frame.view, frame.pair, frame.compared.consistent
-        mask, odd, off = judged, looks_odd, frame.heights.mean_off
+        mask, odd = judged, looks_odd
         for _ in range(2):
             mask = fill_regions(frame, mask, odd)
             mask = fill_gaps(view, frame.profile, mask, consistent & ~odd)
-            unlike = unlike_floor(pair.left[pair.part], mask == FLOOR)
-            odd = unlike & (off | looks_odd)
-            mask = without_floor(mask, unlike & off & pair.textured)
+            odd &= unlike_floor(pair.left[pair.part], mask == FLOOR)
         if pair.said_there is not None:
             self.network.note(pair.said_there, mask)
             if self.network.is_trusted:
@@ -277,13 +274,12 @@ class FloorSegmentation:
         return self._overhead.in_the_way(uv_px.astype(float), at.astype(float), view.mount)
 
 
-def _judged(frame: FrameEvidence, step_m: float) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+def _judged(frame: FrameEvidence) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Return a mask (R, W) of what the pixels of a frame say by themselves, cut back to edges, and
-    of what a network says stands there; and what does not look like floor (R, W). step_m: what a
-    robot climbs.
+    of what a network says stands there; and what does not look like floor (R, W).
     """
     pair = frame.pair
-    mask = trim_to_edges(judge(frame, step_m), pair.slope)
+    mask = trim_to_edges(judge(frame), pair.slope)
     odd = unlike_floor(pair.left[pair.part], mask == FLOOR)
     # What stands may look like that, and what is measured to be floor stays so.
     doubtful = (mask == FLOOR) & odd

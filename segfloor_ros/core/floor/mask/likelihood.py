@@ -232,8 +232,8 @@ class Likelihood:
         self, mask: NDArray[np.uint8], seen: Seen
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Return a mask (R, W) without floor that is not likely, and with what surely is floor,
-        where that is measured, or carried to what only the left camera sees; and what was floor
-        (R, W) and is none only as it is higher, though no higher than a robot climbs. What lies too
+        where that is measured, or carried to what only the left camera sees; and what is
+        none only as it is higher, though no higher than a robot climbs (R, W). What lies too
         low for a robot is a drop, or what a floor mirrors, and no floor however it looks.
         """
         known = known_weight(seen)
@@ -260,7 +260,7 @@ class Likelihood:
             unlikely |= one_sided & (carried < 0)
             sure |= one_sided & (carried > _SURE)
         sure &= ~unlikely
-        climbed = enlarged(climbed, mask) & (mask == FLOOR)
+        climbed = enlarged(climbed, mask) & (mask != NOT_FLOOR)
         found = with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))
         return found, climbed
 

@@ -186,9 +186,8 @@ class FrameEvidence:
         return np.where(good, average, np.float32(np.nan))
 
 
-def judge(frame: FrameEvidence, step_m: float) -> NDArray[np.uint8]:
-    """Return a mask (R, W) of what the pixels of a frame say by themselves. step_m: what a robot
-    climbs.
+def judge(frame: FrameEvidence) -> NDArray[np.uint8]:
+    """Return a mask (R, W) of what the pixels of a frame say by themselves.
 
     A disparity makes floor only where the images agree, and denies it only where they do.
     """
@@ -202,10 +201,6 @@ def judge(frame: FrameEvidence, step_m: float) -> NDArray[np.uint8]:
     mask[above & sure] = NOT_FLOOR
     mask[_below_contact(view, heights.floor_row, above & sure & heights.near)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
-    # On a sill the images contradict the floor, and show that it is a sill; beyond it floor goes on
-    # where above a foot there is what stands on it.
-    sill = compared.against & (np.abs(heights.height) <= np.float32(step_m))
-    mask[may_be & sill & below_floor(mask)] = FLOOR
     return mask
 
 
