@@ -266,39 +266,22 @@ class Likelihood:
 
 
 def carry(log_ratio: Picture, weight: Picture, seen: Seen) -> Picture:
-    """Return the log ratio of what is known around each pixel (h, w), which edges of the image keep
-    from spreading; toward 0 where nothing is near. weight: of what is known.
+    """Return the log ratio of what is known to the right of each pixel (h, w), which edges of the
+    image keep from spreading; toward 0 where nothing is near. weight: of what is known.
 
-    The normalised convolution of Gastal and Oliveira, Domain Transform for Edge-Aware Image and
-    Video Processing (2011), at half of this resolution, along rows and then along columns. What
-    stands is no floor, however little of it is measured.
+    Along rows, as the normalised convolution of Gastal and Oliveira, Domain Transform for
+    Edge-Aware Image and Video Processing (2011). What stands is no floor, however little of it is
+    measured.
     """
-    # Farther from these columns nothing gets there.
-    reach = int(np.flatnonzero(seen.left_only.any(axis=0))[-1]) + 2 * round(_CARRY_PX)
-    part = np.s_[:, :reach]
-    stands = seen.mask[part] == NOT_FLOOR
-    weight = np.where(stands, np.float32(1), weight[part])
-    bounded = np.clip(np.where(stands, -_MOST_NATS, log_ratio[part]), -_MOST_NATS, _MOST_NATS)
-    level = np.log(seen.grey[part] + 8)
-    few = [cv2.blur(one, (3, 3))[::2, ::2] for one in (bounded * weight, weight, level)]
-    parts = np.stack(few[:2])
-    steps = [np.abs(np.diff(few[2], axis=axis, prepend=few[2].max())) for axis in (1, 0)]
-    own = np.median(np.minimum(*steps)[parts[0] > LEAST_KNOWN].tolist() or 1.0)
-    for step, axis in zip(steps, (2, 1), strict=True):
-        kept = np.exp(-2 / _CARRY_PX - np.maximum(step / (2 * max(own, 1e-3)) - 1, 0))
-        parts = _spread_along(parts, kept.astype(np.float32), axis)
-    carried = np.zeros_like(log_ratio)
-    carried[part] = cv2.resize(parts[0] / (parts[1] + np.float32(_NOTHING)), stands.shape[::-1])
+    stands = seen.mask == NOT_FLOOR
+    weight = np.where(stands, np.float32(1), weight)
+    bounded = np.clip(np.where(stands, -_MOST_NATS, log_ratio), -_MOST_NATS, _MOST_NATS)
+    level = np.log(cv2.blur(seen.grey, (5, 5)) + 8)
+    step = np.abs(np.diff(level, axis=1, append=level[:, -1:]))
+    own = np.median(step[weight * bounded > LEAST_KNOWN].tolist() or 1.0)
+    kept = np.exp(-1 / _CARRY_PX - np.maximum(step / (2 * max(own, 1e-3)) - 1, 0))
+    parts = np.stack([cv2.blur(part, (5, 15)) for part in (bounded * weight, weight)])
+    for column in reversed(range(parts.shape[2] - 1)):
+        parts[..., column] += kept[:, column] * parts[..., column + 1]
+    carried: Picture = parts[0] / (parts[1] + np.float32(_NOTHING))
     return carried
-
-
-def _spread_along(parts: Picture, kept: Picture, axis: int) -> Picture:
-    """Return pictures (n, h, w) with what comes from both sides along an axis; kept: (h, w), which
-    share of that is left from the pixel before on.
-    """
-    lines, share = np.moveaxis(parts, axis, 0), np.moveaxis(kept, axis - 1, 0)
-    forth, back = lines.copy(), lines.copy()
-    for i in range(1, len(lines)):
-        forth[i] += share[i] * forth[i - 1]
-        back[-1 - i] += share[-i] * back[-i]
-    return np.moveaxis(forth + back - lines, 0, axis)
