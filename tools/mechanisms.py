@@ -200,13 +200,6 @@ FLOOR: dict[str, Mechanism] = {
             )
         }
     ),
-    'what stands is not filled': Mechanism(
-        {
-            'core.floor.mask.pixel_evidence.Heights.standing': property(
-                lambda self: _nowhere(self.height)
-            )
-        }
-    ),
     'trimming to edges': Mechanism({'core.floor.segmentation.trim_to_edges': _first}),
     'what hangs at the height of the robot': Mechanism(
         {'core.floor.scan.OverheadMatcher.positions': lambda *_, **__: np.zeros((2, 0), np.float32)}

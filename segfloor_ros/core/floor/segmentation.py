@@ -219,18 +219,16 @@ class FloorSegmentation:
         return disparity
 
     def _fill(
-        self, frame: FrameEvidence, judged: NDArray[np.uint8], looks_odd: NDArray[np.bool_]
+        self, frame: FrameEvidence, mask: NDArray[np.uint8], looks_odd: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
         """Return the mask with floor where this pair of images alone cannot tell: where it looks
         like floor. The more floor is known the more goes on, so this is done twice. Nor does it
         contradict a network that was right so far.
         """
         view, pair, consistent = frame.view, frame.pair, frame.compared.consistent
-        mask, odd = judged, looks_odd
         for _ in range(2):
-            mask = fill_regions(frame, mask, odd)
-            mask = fill_gaps(view, frame.profile, mask, consistent & ~odd)
-            odd &= unlike_floor(pair.left[pair.part], mask == FLOOR)
+            mask = fill_regions(frame, mask, looks_odd)
+            mask = fill_gaps(view, frame.profile, mask, consistent & ~looks_odd)
         if pair.said_there is not None:
             self.network.note(pair.said_there, mask)
             if self.network.is_trusted:
@@ -295,14 +293,13 @@ def _seen(frame: FrameEvidence, mask: NDArray[np.uint8], step_m: float) -> Seen:
     """Return what the likelihood weighs. mask: (R, W), with what is floor so far."""
     pair, heights, compared, half = frame.pair, frame.heights, frame.compared, frame.view.half
     grey = cv2.blur(pair.left_rows, (BLOCK_PX, BLOCK_PX))[::STEP_PX, ::STEP_PX]
-    columns = np.arange(0, frame.view.camera.width, STEP_PX)
     return Seen(
         floor_px=compared.floor_px,
         disparity_px=frame.disparity_px[half],
         slope=frame.view.line.slope,
         texture=pair.texture[half] / pair.enough,
         lower=(heights.off & ~heights.above)[half],
-        left_only=columns < compared.floor_px,
+        left_only=frame.view.columns[half[1]] < compared.floor_px,
         grey=grey.astype(np.float32),
         noise_grey=pair.noise_grey if pair.measured is None else 0.0,
         step=step_m / frame.view.mount.height_m,

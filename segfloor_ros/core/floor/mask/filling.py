@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
-from segfloor_ros.core.floor.disparity.matching import SAME_PX
+from segfloor_ros.core.floor.disparity.matching import SAME_PX, SIGMAS
 from segfloor_ros.core.floor.disparity.profile import (
     STEP_PX,
     FloorProfile,
@@ -39,8 +39,6 @@ _MIN_SLOPE = 1.5
 """Grey levels per pixel at half resolution; weaker edges bound no region."""
 _STRONG_SLOPE = 10.0
 """Stronger edges than this are the border of something."""
-_UNMATCHED_PX = 12
-"""So wide a strip at the border of what is matched may be without matches."""
 
 _BEHIND = 0.6
 """The wall behind may show this share of the disparity: the ground may dip, the pitch err."""
@@ -84,7 +82,7 @@ def fill_regions(
     not_blank = cv2.erode(frame.pair.textured[half].astype(np.uint8), margin)
     rows = np.arange(small.shape[0], dtype=np.float32)[:, None]
     inside = (highest < small.shape[0]) & alike & (small == NO_EVIDENCE)
-    nearer = (rows >= highest) & (not_blank > 0) & ~frame.heights.standing[half]
+    nearer = (rows >= highest) & (not_blank > 0) & ~(frame.heights.mean_sigmas[half] > SIGMAS)
     left, right = last_evidence(small, 1)[1], last_evidence(small[:, ::-1], 1)[1][:, ::-1]
     next_to_floor = left & right | below_floor(small)
     fill = inside & (nearer | next_to_floor) & ~odd[half]
@@ -120,20 +118,16 @@ def fill_gaps(
     """Return the mask with NO_EVIDENCE turned to floor along rows, between two floor pixels that
     are near enough to each other, where the images do not contradict the floor (`consistent`).
     """
-    height, width = mask.shape
-    disparity = np.nan_to_num(profile.at_rows(np.arange(height) + view.first_row))
+    disparity = np.nan_to_num(profile.at_rows(np.arange(len(mask)) + view.first_row))
     longest = _GAP_M * view.camera.fx / view.camera.disparity_times_depth * disparity / view.step
     # All rows in turn, each between two columns that are no floor.
     bordered = np.pad(mask, ((0, 0), (1, 1)), constant_values=NOT_FLOOR)
     known = np.flatnonzero(bordered != NO_EVIDENCE)
     gaps = np.flatnonzero(np.diff(known) > 1)
     before, behind = known[gaps], known[gaps + 1]
-    row, column = np.divmod(before, width + 2)
-    across = np.minimum(behind - before, width - column)
-    # The matcher leaves out some columns at the right border.
-    at_border = (behind - before > across) & (across <= _UNMATCHED_PX // view.step)
-    fill = (bordered.take(behind) == FLOOR) | at_border
-    fill &= (bordered.take(before) == FLOOR) & (across <= longest[row])
+    across = behind - before
+    fill = (bordered.take(behind) == FLOOR) & (bordered.take(before) == FLOOR)
+    fill &= across <= longest[before // bordered.shape[1]]
     steps = np.zeros(bordered.size, np.int8)
     steps[before[fill] + 1], steps[behind[fill]] = 1, -1
     filled = np.cumsum(steps, dtype=np.int8).reshape(bordered.shape)[:, 1:-1] > 0
@@ -143,11 +137,10 @@ def fill_gaps(
 def drop_islands(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the mask without patches of floor smaller than a share of the largest."""
     small = (mask[::STEP_PX, ::STEP_PX] == FLOOR).astype(np.uint8)
-    count, label, stats, _ = cv2.connectedComponentsWithStats(small, connectivity=8)
-    if count < 3:
-        return mask
+    _, label, stats, _ = cv2.connectedComponentsWithStats(small, connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA]
-    return without_floor(mask, enlarged((area < _ISLAND_SHARE * area[1:].max())[label], mask))
+    is_small = area < _ISLAND_SHARE * area[1:].max(initial=0)
+    return without_floor(mask, enlarged(is_small[label], mask))
 
 
 def trim_to_edges(mask: NDArray[np.uint8], slope: NDArray[np.int16]) -> NDArray[np.uint8]:

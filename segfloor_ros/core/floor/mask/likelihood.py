@@ -11,7 +11,6 @@ All pictures here are of half the resolution of the image, (h, w) float32.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -58,19 +57,19 @@ _CARRY_PX = 20.0
 
 _LOCAL, _ROUNDS = (31, 15), 4
 """Columns and rows of the window in which the floor around a pixel is measured, and how often."""
-_NOTHING = 0.02
-"""So small a share of a window tells nothing."""
+_NOTHING, _DENSE = 0.02, 0.5
+"""A share of a window that tells nothing, and one that ground reaches where it is matched: what only
+one camera sees is matched less, by chance.
+"""
 _BLOCK, _NEAR, _WIDE = (COARSE_BLOCK_PX, COARSE_BLOCK_PX), (5, 5), (9, 9)
 """Columns and rows of the block that is matched, and of the windows over which pixels are averaged,
 and are counted."""
 _MOST_SIGMAS, _MOST_NATS = 12.0, 6.0
 """No feature says more: what is wrong is then as wrong as it can be."""
-_DENSE = 0.5
-"""Ground is matched more densely than this, and what only one camera sees less."""
-_UNEVEN_PX = MEAN_NOISE * NOISE_PX, 1.4
-"""How uneven the disparities of floors are, at least, as neighbours err together, and at most."""
-_RISE_SIGMA_PX = 0.7, 2.0
-"""Error of the difference of two disparities, at least and at most."""
+_UNEVEN_PX, _RISE_SIGMA_PX = (MEAN_NOISE * NOISE_PX, 1.4), (0.7, 2.0)
+"""How uneven the disparities of floors are, at least, as neighbours err together, and at most; and
+the error of the difference of two.
+"""
 _BINS, _END = 2, 10
 """Of the histogram of brightness, per sigma of the floor's; it ends at so many sigmas."""
 _FOREIGN, _UNSEEN = 0.05, 0.2
@@ -101,11 +100,6 @@ class Seen:
     step: float
     mask: NDArray[np.uint8]
 
-    @property
-    def is_floor(self) -> NDArray[np.bool_]:
-        """What is floor so far."""
-        return self.mask == FLOOR
-
 
 def known_weight(seen: Seen) -> Picture:
     """Return how well the disparity of each pixel is known (h, w), in [0, 1], 1 where as well as it
@@ -113,9 +107,8 @@ def known_weight(seen: Seen) -> Picture:
     """
     weight: Picture = np.clip(2 * seen.texture - 1, 0, 1) * (seen.disparity_px > 0)
     slope = cv2.Sobel(seen.grey, cv2.CV_32F, 1, 0, ksize=1, scale=1 / (2 * STEP_PX))
-    pixels = _BLOCK[0] * _BLOCK[1]
     power = cv2.boxFilter(slope * slope, -1, _BLOCK, normalize=False)
-    power -= np.float32(pixels * NOISE_SLOPE * seen.noise_grey**2)
+    power -= np.float32(_BLOCK[0] * _BLOCK[1] * NOISE_SLOPE * seen.noise_grey**2)
     variance = np.float32(2 * seen.noise_grey**2) / np.maximum(power, np.float32(1e-3))
     return weight * (np.float32(NOISE_PX) / np.sqrt(np.float32(NOISE_PX**2) + variance))
 
@@ -125,7 +118,7 @@ def features(seen: Seen, weight: Picture) -> tuple[Picture, NDArray[np.bool_]]:
     than a robot climbs (h, w). weight: as of `known_weight`.
     """
     known = (seen.disparity_px > 0).astype(np.float32)
-    height, mostly_on, is_low = _height(seen, weight)
+    height, mostly_on, is_low = _height(seen, weight, known)
     rises = _rise(seen, weight, known)
     # What is as level as a floor is none where it is higher, and what stands on it is higher.
     is_level = np.exp(-(height**2) / 2)
@@ -143,7 +136,9 @@ def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, floa
     return np.float32(np.clip(spread, *bounds))
 
 
-def _height(seen: Seen, weight: Picture) -> tuple[Picture, Picture, NDArray[np.bool_]]:
+def _height(
+    seen: Seen, weight: Picture, known: Picture
+) -> tuple[Picture, Picture, NDArray[np.bool_]]:
     """Return how high blocks of pixels are above the floor around them, in sigmas, and which share
     around each is on it, less that which is off it.
 
@@ -151,7 +146,6 @@ def _height(seen: Seen, weight: Picture) -> tuple[Picture, Picture, NDArray[np.b
     may lie above the ground beside a stone: at first what is lower counts as floor, but nothing
     that is higher.
     """
-    known = (seen.disparity_px > 0).astype(np.float32)
     most_px = _MOST_SIGMAS * SAME_PX
     above = np.clip(seen.disparity_px - seen.floor_px, -most_px, most_px) * known
     share = cv2.blur(weight, _BLOCK)
@@ -199,19 +193,19 @@ def _look(seen: Seen) -> Picture:
     """Return the log ratio of how often the brightness of each pixel is seen of the floor and of
     what stands on it; 0 where no floor is known.
     """
-    bins = sigmas_off_floor(seen.grey, seen.is_floor, STEP_PX) * _BINS
+    is_floor = seen.mask == FLOOR
+    bins = sigmas_off_floor(seen.grey, is_floor, STEP_PX) * _BINS
     bins = np.clip(bins + (_END * _BINS + 0.5), 0, 2 * _END * _BINS).astype(np.intp)
     number = 2 * _END * _BINS + 1
     prior, found = np.full(number, 1 / number), []
-    for some, other in ((seen.is_floor, _FOREIGN), (seen.mask == NOT_FLOOR, _UNSEEN)):
+    for some, other in ((is_floor, _FOREIGN), (seen.mask == NOT_FLOOR, _UNSEEN)):
         counts = np.convolve(np.bincount(bins[some], minlength=number), (0.25, 0.5, 0.25), 'same')
         # The fewer are seen the more counts what is known before.
         share = (1 - other) / (counts.sum() + number)
         found.append(share * (counts + number * prior) + other * prior)
         prior = (prior + found[0]) / 2
-    ratio = np.log(found[0] / found[1]).astype(np.float32)
-    look: Picture = np.clip(ratio, -_MOST_NATS, _MOST_NATS)[bins] * np.float32(seen.is_floor.any())
-    return look
+    look: Picture = np.log(found[0] / found[1]).astype(np.float32)[bins]
+    return look * np.float32(is_floor.any())
 
 
 def _with_border(part: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -225,7 +219,7 @@ class Likelihood:
     """Finds how likely the pixels of a frame are floor. weights: of the features, (F,); `WEIGHTS`
     where none are given."""
 
-    def __init__(self, weights: Sequence[float] | Array | None = None) -> None:
+    def __init__(self, weights: Array | None = None) -> None:
         self.weights = np.array(list(WEIGHTS.values()) if weights is None else weights, np.float32)
 
     def weighed(
@@ -247,22 +241,20 @@ class Likelihood:
         is_higher = judged & (log_ratio < -_SURE) & (every[1] > SIGMAS)
         blocked = (unlikely & ~climbed) | _with_border(is_higher & ~climbed)
         unlikely |= _with_border(is_higher)
-        climbed = unlikely & ~blocked
+        climbed = unlikely & ~blocked & (seen.mask != NOT_FLOOR)
         sure = judged & ~seen.lower & (log_ratio > _SURE)
         one_sided = seen.left_only & near_enough & ~judged
-        if one_sided.any():
-            # What both cameras see there is a drop, if it is more than some matches by chance.
-            shown = mean_of_known(known, (seen.texture > 1).astype(np.float32), _WIDE)[0]
-            counts = judged & ~(seen.left_only & (shown < _DENSE))
-            values = np.where(seen.lower, np.float32(-_MOST_NATS), log_ratio)
-            carried = carry(values, known * counts, seen)
-            carried += every[-1] / 2
-            unlikely |= one_sided & (carried < 0)
-            sure |= one_sided & (carried > _SURE)
+        # What both cameras see there is a drop, if it is more than some matches by chance.
+        shown = mean_of_known(known, (seen.texture > 1).astype(np.float32), _WIDE)[0]
+        counts = judged & ~(seen.left_only & (shown < _DENSE))
+        values = np.where(seen.lower, np.float32(-_MOST_NATS), log_ratio)
+        carried = carry(values, known * counts, seen)
+        carried += every[-1] / 2
+        unlikely |= one_sided & (carried < 0)
+        sure |= one_sided & (carried > _SURE)
         sure &= ~unlikely
-        climbed = enlarged(climbed, mask) & (mask != NOT_FLOOR)
         found = with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))
-        return found, climbed
+        return found, enlarged(climbed, mask)
 
 
 def carry(log_ratio: Picture, weight: Picture, seen: Seen) -> Picture:
@@ -283,5 +275,4 @@ def carry(log_ratio: Picture, weight: Picture, seen: Seen) -> Picture:
     parts = np.stack([cv2.blur(part, (5, 15)) for part in (bounded * weight, weight)])
     for column in reversed(range(parts.shape[2] - 1)):
         parts[..., column] += kept[:, column] * parts[..., column + 1]
-    carried: Picture = parts[0] / (parts[1] + np.float32(_NOTHING))
-    return carried
+    return np.asarray(parts[0] / (parts[1] + np.float32(_NOTHING)))

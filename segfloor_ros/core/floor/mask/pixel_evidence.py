@@ -120,11 +120,6 @@ class Heights:
         """
         return np.abs(self.mean_sigmas) > SIGMAS * MEAN_NOISE
 
-    @cached_property
-    def standing(self) -> NDArray[np.bool_]:
-        """What in the mean of its neighbours lies above the floor, (R, W)."""
-        return self.mean_sigmas > SIGMAS
-
     @classmethod
     def of(
         cls,
@@ -334,9 +329,8 @@ def _foreign(
         noise = max(noise, float(np.median((variance + other)[lying] / 2 - shared[lying])))
     expected = 1 - np.float32(noise) / variance
     texture, least = _FOREIGN
-    return np.asarray(
-        (expected > texture) & (shared < least * expected * np.sqrt(variance * other))
-    )
+    differs: NDArray[np.bool_] = shared < least * expected * np.sqrt(variance * other)
+    return differs & (expected > texture)
 
 
 def _local_difference(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
