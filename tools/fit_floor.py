@@ -54,8 +54,10 @@ class Recorder(Likelihood):
     seen: Seen
     rows: int
 
-    def weighed(self, mask: NDArray[np.uint8], seen: Seen) -> NDArray[np.uint8]:
-        """Return a mask (R, W) corrected."""
+    def weighed(
+        self, mask: NDArray[np.uint8], seen: Seen
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Return a mask (R, W) corrected, and what is climbed."""
         self.seen, self.rows = seen, len(mask)
         return super().weighed(mask, seen)
 
@@ -108,7 +110,7 @@ def pixels_of(drive: FloorDrive, configuration: Configuration, rng: np.random.Ge
         counts = (label != UNKNOWN) & (seen.floor_px > SAME_PX) & (known > LEAST_KNOWN)
         if frame.moving is not None:
             counts &= frame.moving[part] == 0
-        parts = features(seen, known)
+        parts, _ = features(seen, known)
         for kind in (True, False):
             at = np.flatnonzero(counts & ((label == TRUE_FLOOR) == kind))
             at = rng.choice(at, min(PIXELS, len(at)), replace=False) if len(at) else at

@@ -190,26 +190,13 @@ FLOOR: dict[str, Mechanism] = {
     'texture that is not of the floor': Mechanism(
         {'core.floor.mask.pixel_evidence._foreign': lambda left, *_: _nowhere(left)}
     ),
-    'most of what is measured around': Mechanism(
-        {'core.floor.mask.pixel_evidence.most_around': lambda said, _: ~_nowhere(said)}
-    ),
     'likelihood of floor': Mechanism(
         {'core.floor.segmentation.Likelihood.weighed': lambda self, mask, seen: mask}
-    ),
-    'what stands beside the left border': Mechanism(
-        {'core.floor.segmentation.beside_something': lambda view, mask: _nowhere(mask)}
     ),
     'floor beside the profile': Mechanism(
         {
             'core.floor.mask.pixel_evidence.lies_on_floor': lambda view, disparity, _: _nowhere(
                 disparity
-            )
-        }
-    ),
-    'what stands is not filled': Mechanism(
-        {
-            'core.floor.mask.pixel_evidence.Heights.standing': property(
-                lambda self: _nowhere(self.height)
             )
         }
     ),

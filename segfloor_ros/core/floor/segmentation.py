@@ -36,7 +36,6 @@ from segfloor_ros.core.floor.disparity.profile import (
 )
 from segfloor_ros.core.floor.mask.filling import (
     NetworkFloor,
-    beside_something,
     blank_feet,
     drop_islands,
     fill_gaps,
@@ -131,19 +130,22 @@ class FloorSegmentation:
             compared = compare(view, profile, pair, below, heights)
             frame = FrameEvidence(view, profile, pair, below, heights, compared)
         with measure('evidence'):
-            judged, odd = _judged(frame, self._settings.step_height_m)
+            judged, odd = _judged(frame)
         with measure('filling'):
             mask = self._fill(frame, judged, odd)
         with measure('likelihood'):
-            mask = drop_islands(self.likelihood.weighed(mask, _seen(frame, mask)))
+            seen = _seen(frame, mask, self._settings.step_height_m)
+            mask, climbed = self.likelihood.weighed(mask, seen)
+            driven = drop_islands(with_floor(mask, climbed))
             if not is_shown:
-                mask[mask == FLOOR] = NO_EVIDENCE
-            mask = pair.without_hidden(mask)
+                driven[driven == FLOOR] = NO_EVIDENCE
+            driven = pair.without_hidden(driven)
+            mask = without_floor(driven, climbed)
         with measure(DISPARITY_ABOVE):
             hanging_xy = self._overhead.positions(pair, view.mount)
         with measure('scan'):
             movable_xy = None if movable is None else self._positions(view, movable)
-            scan = self._scan(frame, judged, mask, hanging_xy, movable_xy)
+            scan = self._scan(frame, judged, driven, hanging_xy, movable_xy)
         if movable is not None:
             disparity = np.maximum(disparity, movable)
         return FloorObservation(
@@ -217,22 +219,16 @@ class FloorSegmentation:
         return disparity
 
     def _fill(
-        self, frame: FrameEvidence, judged: NDArray[np.uint8], looks_odd: NDArray[np.bool_]
+        self, frame: FrameEvidence, mask: NDArray[np.uint8], looks_odd: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
         """Return the mask with floor where this pair of images alone cannot tell: where it looks
-        like floor. The more floor is known the better is known how it looks, so this is done twice,
-        and what then does not look like it is floor only if it was measured. Nor does it contradict
-        a network that was right so far.
+        like floor. The more floor is known the more goes on, so this is done twice. Nor does it
+        contradict a network that was right so far.
         """
         view, pair, consistent = frame.view, frame.pair, frame.compared.consistent
-        mask, odd, off = judged, looks_odd, frame.heights.mean_off
-        beside = beside_something(view, mask)
         for _ in range(2):
-            mask = fill_regions(frame, mask, beside, odd)
-            mask = fill_gaps(view, frame.profile, mask, consistent & ~(beside | odd))
-            unlike = unlike_floor(pair.left[pair.part], mask == FLOOR)
-            odd = unlike & (off | looks_odd)
-            mask = without_floor(mask, unlike & off & pair.textured)
+            mask = fill_regions(frame, mask, looks_odd)
+            mask = fill_gaps(view, frame.profile, mask, consistent & ~looks_odd)
         if pair.said_there is not None:
             self.network.note(pair.said_there, mask)
             if self.network.is_trusted:
@@ -276,15 +272,14 @@ class FloorSegmentation:
         return self._overhead.in_the_way(uv_px.astype(float), at.astype(float), view.mount)
 
 
-def _judged(frame: FrameEvidence, step_m: float) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+def _judged(frame: FrameEvidence) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Return a mask (R, W) of what the pixels of a frame say by themselves, cut back to edges, and
-    left open where they do not look like floor and are not measured to lie on it; and of what a
-    network says stands there; and what does not look like floor (R, W). step_m: what a robot
-    climbs.
+    of what a network says stands there; and what does not look like floor (R, W).
     """
     pair = frame.pair
-    mask = trim_to_edges(judge(frame, step_m), pair.slope)
+    mask = trim_to_edges(judge(frame), pair.slope)
     odd = unlike_floor(pair.left[pair.part], mask == FLOOR)
+    # What stands may look like that, and what is measured to be floor stays so.
     doubtful = (mask == FLOOR) & odd
     mask = without_floor(mask, doubtful)
     mask = with_floor(mask, doubtful & ~frame.heights.mean_off & below_floor(mask))
@@ -294,7 +289,7 @@ def _judged(frame: FrameEvidence, step_m: float) -> tuple[NDArray[np.uint8], NDA
     return mask, odd
 
 
-def _seen(frame: FrameEvidence, mask: NDArray[np.uint8]) -> Seen:
+def _seen(frame: FrameEvidence, mask: NDArray[np.uint8], step_m: float) -> Seen:
     """Return what the likelihood weighs. mask: (R, W), with what is floor so far."""
     pair, heights, compared, half = frame.pair, frame.heights, frame.compared, frame.view.half
     grey = cv2.blur(pair.left_rows, (BLOCK_PX, BLOCK_PX))[::STEP_PX, ::STEP_PX]
@@ -304,10 +299,11 @@ def _seen(frame: FrameEvidence, mask: NDArray[np.uint8]) -> Seen:
         slope=frame.view.line.slope,
         texture=pair.texture[half] / pair.enough,
         lower=(heights.off & ~heights.above)[half],
+        left_only=frame.view.columns[half[1]] < compared.floor_px,
         grey=grey.astype(np.float32),
-        better=compared.better,
         noise_grey=pair.noise_grey if pair.measured is None else 0.0,
-        is_floor=mask[half] == FLOOR,
+        step=step_m / frame.view.mount.height_m,
+        mask=mask[half],
     )
 
 

@@ -177,14 +177,22 @@ def test_a_low_box_is_not_floor():
     assert np.allclose(observation.scan.ranges_m[ahead], 1.5, atol=0.06)
 
 
-def test_a_door_sill_is_floor():
+@pytest.mark.parametrize(('step_m', 'least_m', 'most_m'), [(0.03, 3.5, 4.1), (0.01, 1.3, 1.6)])
+def test_a_door_sill_is_no_floor_but_a_robot_that_climbs_it_sees_what_is_behind(
+    step_m, least_m, most_m
+):
     scene = Scene([floor_patch(), wall(), *box(1.5, 0.0, 0.3, 0.02, is_floor=True)])
-    observation, _, depth = segment(scene)
+    left, right, _, depth = scene.render()
+    settings = dataclasses.replace(SETTINGS, step_height_m=step_m)
+    observation = FloorSegmentation(scene.camera, settings).process(left, right, scene.mount)
     points = points_of(scene, depth)
     sill = (points[..., 2] > 0.01) & (points[..., 0] < 1.9)
-    assert np.mean(observation.mask[sill] == FLOOR) > 0.9
+    assert np.mean(observation.mask[sill] == FLOOR) < 0.1
+    if step_m > 0.02:
+        assert np.mean(observation.mask[sill] == NOT_FLOOR) < 0.02
     ahead = np.abs(observation.scan.bearings_rad) < np.radians(3)
-    assert np.all(observation.scan.ranges_m[ahead] > 3.5)
+    ranges_m = observation.scan.ranges_m[ahead]
+    assert np.all(ranges_m > least_m) and np.all(ranges_m < most_m)
 
 
 @pytest.mark.parametrize('x_m', [1.0, 1.5])

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
-from segfloor_ros.core.floor.disparity.matching import SAME_PX
+from segfloor_ros.core.floor.disparity.matching import SAME_PX, SIGMAS
 from segfloor_ros.core.floor.disparity.profile import (
     STEP_PX,
     FloorProfile,
@@ -39,8 +39,6 @@ _MIN_SLOPE = 1.5
 """Grey levels per pixel at half resolution; weaker edges bound no region."""
 _STRONG_SLOPE = 10.0
 """Stronger edges than this are the border of something."""
-_UNMATCHED_PX = 12
-"""So wide a strip at the border of what is matched may be without matches."""
 
 _BEHIND = 0.6
 """The wall behind may show this share of the disparity: the ground may dip, the pitch err."""
@@ -56,16 +54,16 @@ measured."""
 
 
 def fill_regions(
-    frame: FrameEvidence, mask: NDArray[np.uint8], beside: NDArray[np.bool_], odd: NDArray[np.bool_]
+    frame: FrameEvidence, mask: NDArray[np.uint8], odd: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
     """Return the mask with NO_EVIDENCE turned to floor in regions that look alike and continue
     floor.
 
-    beside, odd: (R, W), where no region goes on: `beside_something`, and what does not look like
-    floor. A region is bounded by edges of the image stronger than most of the floor's own; floor by
-    evidence must be in a share of its columns. In it a pixel becomes floor below floor, the next
-    evidence up its column; or between floor on its left and right; or, if it is not blank and not
-    measured above the floor, nearer than any of its floor.
+    odd: (R, W), what does not look like floor: there no region goes on. A region is bounded by
+    edges of the image stronger than most of the floor's own; floor by evidence must be in a share
+    of its columns. In it a pixel becomes floor below floor, the next evidence up its column; or
+    between floor on its left and right; or, if it is not blank and not measured above the floor,
+    nearer than any of its floor.
     """
     half, slope = frame.view.half, frame.pair.picture_slope
     small = mask[half]
@@ -84,10 +82,10 @@ def fill_regions(
     not_blank = cv2.erode(frame.pair.textured[half].astype(np.uint8), margin)
     rows = np.arange(small.shape[0], dtype=np.float32)[:, None]
     inside = (highest < small.shape[0]) & alike & (small == NO_EVIDENCE)
-    nearer = (rows >= highest) & (not_blank > 0) & ~frame.heights.standing[half]
+    nearer = (rows >= highest) & (not_blank > 0) & ~(frame.heights.mean_sigmas[half] > SIGMAS)
     left, right = last_evidence(small, 1)[1], last_evidence(small[:, ::-1], 1)[1][:, ::-1]
     next_to_floor = left & right | below_floor(small)
-    fill = inside & (nearer | next_to_floor) & ~(beside | odd)[half]
+    fill = inside & (nearer | next_to_floor) & ~odd[half]
     mask = with_floor(mask, enlarged(fill, mask))
     # Light on the floor is no border, where both ends of a stretch are known.
     no_border = agreed & (slope < _STRONG_SLOPE)
@@ -114,40 +112,22 @@ def _top_of_supported(
     return np.where(is_large & is_wide, first, len(region))
 
 
-def beside_something(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Tell of what only the left camera sees, at the left border of a mask (R, W), where it does
-    not lie beside floor that both cameras see: what stands there is taken to go on.
-    """
-    floor_px = np.float32(view.line.slope) * (view.derolled - np.float32(view.line.horizon))
-    first = (mask != NO_EVIDENCE).argmax(axis=1)[:, None]
-    begins_with_floor = np.take_along_axis(mask, first, axis=1) == FLOOR
-    begins_with_floor &= first * view.step <= floor_px[:, :1] + _UNMATCHED_PX
-    # Rows in between begin with a hole, as high as the window in which texture is measured.
-    hole = np.ones((TEXTURE_WINDOW_PX + 2, 1), np.uint8)
-    near = cv2.dilate(begins_with_floor.view(np.uint8), hole)
-    return (view.columns < floor_px) & (near == 0)
-
-
 def fill_gaps(
     view: FloorView, profile: FloorProfile, mask: NDArray[np.uint8], consistent: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
     """Return the mask with NO_EVIDENCE turned to floor along rows, between two floor pixels that
     are near enough to each other, where the images do not contradict the floor (`consistent`).
     """
-    height, width = mask.shape
-    disparity = np.nan_to_num(profile.at_rows(np.arange(height) + view.first_row))
+    disparity = np.nan_to_num(profile.at_rows(np.arange(len(mask)) + view.first_row))
     longest = _GAP_M * view.camera.fx / view.camera.disparity_times_depth * disparity / view.step
     # All rows in turn, each between two columns that are no floor.
     bordered = np.pad(mask, ((0, 0), (1, 1)), constant_values=NOT_FLOOR)
     known = np.flatnonzero(bordered != NO_EVIDENCE)
     gaps = np.flatnonzero(np.diff(known) > 1)
     before, behind = known[gaps], known[gaps + 1]
-    row, column = np.divmod(before, width + 2)
-    across = np.minimum(behind - before, width - column)
-    # The matcher leaves out some columns at the right border.
-    at_border = (behind - before > across) & (across <= _UNMATCHED_PX // view.step)
-    fill = (bordered.take(behind) == FLOOR) | at_border
-    fill &= (bordered.take(before) == FLOOR) & (across <= longest[row])
+    across = behind - before
+    fill = (bordered.take(behind) == FLOOR) & (bordered.take(before) == FLOOR)
+    fill &= across <= longest[before // bordered.shape[1]]
     steps = np.zeros(bordered.size, np.int8)
     steps[before[fill] + 1], steps[behind[fill]] = 1, -1
     filled = np.cumsum(steps, dtype=np.int8).reshape(bordered.shape)[:, 1:-1] > 0
@@ -157,11 +137,10 @@ def fill_gaps(
 def drop_islands(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the mask without patches of floor smaller than a share of the largest."""
     small = (mask[::STEP_PX, ::STEP_PX] == FLOOR).astype(np.uint8)
-    count, label, stats, _ = cv2.connectedComponentsWithStats(small, connectivity=8)
-    if count < 3:
-        return mask
+    _, label, stats, _ = cv2.connectedComponentsWithStats(small, connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA]
-    return without_floor(mask, enlarged((area < _ISLAND_SHARE * area[1:].max())[label], mask))
+    is_small = area < _ISLAND_SHARE * area[1:].max(initial=0)
+    return without_floor(mask, enlarged(is_small[label], mask))
 
 
 def trim_to_edges(mask: NDArray[np.uint8], slope: NDArray[np.int16]) -> NDArray[np.uint8]:

@@ -37,12 +37,7 @@ from segfloor_ros.core.floor.disparity.profile import (
     pixels_where,
     surface_above,
 )
-from segfloor_ros.core.floor.mask.painting import (
-    LEAST_KNOWN,
-    enlarged,
-    mean_of_known,
-    without_floor,
-)
+from segfloor_ros.core.floor.mask.painting import LEAST_KNOWN, enlarged, mean_of_known
 from segfloor_ros.core.floor.pair import Pair
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
@@ -71,9 +66,6 @@ _MARGIN_PX = 4.0
 _NOISE_SHARE = 2.0
 """Two images of the same thing differ by 1.13 sigma of noise on average, and by interpolation."""
 
-_UNEQUAL_GREY = 0.8, 0.3
-"""Mean difference of both images of the same thing: so many sigmas of noise, and grey levels."""
-
 _UPRIGHT_WINDOW = 7, 5
 """Columns and rows of the window above the contact in which the upright surface is measured."""
 _GAP_ROWS = 2
@@ -89,7 +81,6 @@ class Comparison:
     against: clearly more like the matched disparity than like floor. denied: the same of the
     surroundings taken together. unlike: unlike floor, whatever it is. consistent: may be floor, not
     denied.
-    better: float32 as floor_px, `matched_better`.
     """
 
     floor_px: NDArray[np.float32]
@@ -97,7 +88,6 @@ class Comparison:
     denied: NDArray[np.bool_]
     unlike: NDArray[np.bool_]
     consistent: NDArray[np.bool_]
-    better: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -129,11 +119,6 @@ class Heights:
         explains.
         """
         return np.abs(self.mean_sigmas) > SIGMAS * MEAN_NOISE
-
-    @cached_property
-    def standing(self) -> NDArray[np.bool_]:
-        """What in the mean of its neighbours lies above the floor, (R, W)."""
-        return self.mean_sigmas > SIGMAS
 
     @classmethod
     def of(
@@ -196,9 +181,8 @@ class FrameEvidence:
         return np.where(good, average, np.float32(np.nan))
 
 
-def judge(frame: FrameEvidence, step_m: float) -> NDArray[np.uint8]:
-    """Return a mask (R, W) of what the pixels of a frame say by themselves. step_m: what a robot
-    climbs.
+def judge(frame: FrameEvidence) -> NDArray[np.uint8]:
+    """Return a mask (R, W) of what the pixels of a frame say by themselves.
 
     A disparity makes floor only where the images agree, and denies it only where they do.
     """
@@ -206,28 +190,13 @@ def judge(frame: FrameEvidence, step_m: float) -> NDArray[np.uint8]:
     above, off, textured = heights.above, heights.off, frame.pair.textured
     # What seems to lie below the floor may be what the floor mirrors.
     sure = (textured & compared.against) | (compared.denied & above)
-    measured = textured & (frame.disparity_px >= np.float32(LEAST_FLOOR_PX))
-    may_be = measured & ~off
+    may_be = textured & ~off & (frame.disparity_px >= np.float32(LEAST_FLOOR_PX))
     mask = np.full(off.shape, NO_EVIDENCE, np.uint8)
     mask[may_be & ~(compared.against | compared.unlike)] = FLOOR
     mask[above & sure] = NOT_FLOOR
     mask[_below_contact(view, heights.floor_row, above & sure & heights.near)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
-    # On a sill the images contradict the floor, and show that it is a sill; beyond it floor goes on
-    # where above a foot there is what stands on it.
-    sill = compared.against & (np.abs(heights.height) <= np.float32(step_m))
-    mask[may_be & sill & below_floor(mask)] = FLOOR
-    floor = mask == FLOOR
-    return without_floor(mask, ~most_around(floor, measured & (off | floor)))
-
-
-def most_around(said: NDArray[np.bool_], measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return around which pixels (R, W) most of what is measured (R, W) says something (R, W): some
-    of what is matched wrongly lies on the floor by chance.
-    """
-    window = (_WIDE_WINDOW, _WIDE_WINDOW)
-    of_all, of_said = (cv2.blur(part.astype(np.float32), window) for part in (measured, said))
-    return np.asarray(of_said >= np.float32(0.5) * of_all)
+    return mask
 
 
 def last_evidence(
@@ -310,8 +279,7 @@ def compare(
     if pair.measured is not None:
         off_px = np.abs(disparity - profile.at_pixels(view.derolled))
         against = (disparity > 0) & (off_px > np.float32(SAME_PX)) & ~on_floor
-        nowhere, nothing = np.zeros_like(against), np.zeros_like(floor_px)
-        return Comparison(floor_px, against, against, nowhere, ~against, nothing)
+        return Comparison(floor_px, against, against, np.zeros_like(against), ~against)
     left, right, noise_grey = pair.left_rows, pair.right[pair.part[0]], pair.noise_grey
     sampled = left[::STEP_PX, ::STEP_PX]
     rows, columns = STEP_PX * np.indices(sampled.shape, np.float32)
@@ -339,23 +307,7 @@ def compare(
     against, denied, unlike, contrary = (
         enlarged(mask & reached, disparity) for mask in (against, denied, unlike, contrary)
     )
-    better = matched_better(floor, matched, reached, noise_grey)
-    return Comparison(floor_px, against, denied, unlike, ~contrary, better)
-
-
-def matched_better(
-    floor: NDArray[np.float32],
-    matched: NDArray[np.float32],
-    reached: NDArray[np.bool_],
-    noise_grey: float,
-) -> NDArray[np.float32]:
-    """Return the log ratio of how much the images differ on the floor, in grey levels (R, W), to
-    how much they do as matched; 0 where the right image does not reach.
-    """
-    sigmas, grey = _UNEQUAL_GREY
-    noise = np.float32(sigmas * noise_grey + grey)
-    ratio = np.log((floor + noise) / (np.minimum(matched, floor) + noise))
-    return np.asarray(ratio * reached)
+    return Comparison(floor_px, against, denied, unlike, ~contrary)
 
 
 def _foreign(
@@ -377,9 +329,8 @@ def _foreign(
         noise = max(noise, float(np.median((variance + other)[lying] / 2 - shared[lying])))
     expected = 1 - np.float32(noise) / variance
     texture, least = _FOREIGN
-    return np.asarray(
-        (expected > texture) & (shared < least * expected * np.sqrt(variance * other))
-    )
+    differs: NDArray[np.bool_] = shared < least * expected * np.sqrt(variance * other)
+    return differs & (expected > texture)
 
 
 def _local_difference(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -6,7 +6,6 @@ from floor_scenes import FLOORS, Scene, box, floor_patch, wall
 
 from segfloor_ros.core.contracts import FLOOR
 from segfloor_ros.core.floor.mask.look import unlike_floor
-from segfloor_ros.core.floor.mask.pixel_evidence import most_around
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
@@ -71,18 +70,6 @@ def test_a_plain_dark_thing_right_ahead_is_not_filled_as_floor(floor_kind):
     assert (called & thing).sum() < 0.02 * thing.sum()
     wanted = floor & (depth > 0.5) & (depth < 3.0)
     assert (called & wanted).sum() > 0.9 * wanted.sum()
-
-
-def test_matches_that_lie_on_the_floor_by_chance_are_no_floor():
-    """A third of what is measured at the left, two thirds at the right; one in ten is measured."""
-    rng = np.random.default_rng(5)
-    measured = rng.random((120, 400)) < 0.1
-    on_floor = measured & (rng.random(measured.shape) < np.repeat([1 / 3, 2 / 3], 200))
-    believed = most_around(on_floor, measured)
-    assert believed[:, :190][on_floor[:, :190]].mean() < 0.4
-    assert believed[:, 210:][on_floor[:, 210:]].mean() > 0.85
-    everywhere = most_around(on_floor, np.ones(measured.shape, bool))
-    assert not everywhere.any()
 
 
 @pytest.mark.parametrize('floor_kind', FLOORS)

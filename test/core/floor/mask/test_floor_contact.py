@@ -37,7 +37,7 @@ def filled(
     foot_px = float(profile.at_rows(np.array([FIRST_ROW + CONTACT_ROW]))[0])
     disparity = np.where(wall, wall_px_of_floor * foot_px, 0).astype(np.float32)
     floor_px = profile.at_pixels(view.derolled[::2, :: 2 // view.step])
-    compared = Comparison(floor_px, wall, wall, wall, ~wall, np.zeros_like(floor_px))
+    compared = Comparison(floor_px, wall, wall, wall, ~wall)
     plain = ~wall[::2, :: 2 // view.step]
     may_begin = (rows >= shape[0] - alike_rows)[::2, :: 2 // view.step]
     pair = Pair(*6 * [None], 0.0, 1.0, texture=np.where(wall & has_texture, 2.0, 0.0))

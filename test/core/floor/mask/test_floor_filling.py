@@ -5,8 +5,7 @@ import pytest
 from floor_scenes import CAMERA, FLOORS, MOUNT, Patch, Scene, floor_patch, wall
 
 from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
-from segfloor_ros.core.floor.disparity.profile import FloorView
-from segfloor_ros.core.floor.mask.filling import beside_something, drop_islands
+from segfloor_ros.core.floor.mask.filling import drop_islands
 from segfloor_ros.core.floor.pair import image_slope
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
@@ -23,22 +22,6 @@ def test_patches_much_smaller_than_the_floor_are_dropped():
     others = np.ones(mask.shape, bool)
     others[90:100, 180:190] = False
     np.testing.assert_array_equal(dropped[others], mask[others])
-
-
-def test_what_stands_at_the_border_of_the_left_strip_goes_on_in_it():
-    view = FloorView.of(CAMERA, MOUNT, 220)
-    mask = np.full(view.derolled.shape, NO_EVIDENCE, np.uint8)
-    strip = view.columns < view.line.slope * (view.derolled - view.line.horizon)
-    mask[~strip] = FLOOR
-    box, blank = slice(100, 140), slice(180, 220)
-    mask[box][~strip[box]] = NOT_FLOOR
-    mask[blank, :100] = NO_EVIDENCE
-    beside = beside_something(view, mask)
-    assert not beside[~strip].any()
-    for rows in (box, blank):
-        inner = slice(rows.start + 8, rows.stop - 8)
-        assert beside[inner][strip[inner]].all()
-    assert not beside[145:170].any()
 
 
 @pytest.mark.parametrize('floor_kind', FLOORS)

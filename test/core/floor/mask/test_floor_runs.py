@@ -80,7 +80,7 @@ def gap_filled(*rows: str) -> list[str]:
         ('f...f' + 11 * 'x', 'f...f' + 11 * 'x'),  # four
         ('f..x' + 12 * 'x', 'f..x' + 12 * 'x'),
         ('...f' + 12 * 'x', '...f' + 12 * 'x'),  # nothing is known to the left of the image
-        (13 * 'x' + 'f..', 13 * 'x' + 'fff'),  # the matcher leaves out what is at the right
+        (13 * 'x' + 'f..', 13 * 'x' + 'f..'),  # it ends at the border
         (10 * 'x' + 'f.....', 10 * 'x' + 'f.....'),
     ],
 )
