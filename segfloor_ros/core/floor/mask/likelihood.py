@@ -58,9 +58,8 @@ _CARRY_PX = 20.0
 _LOCAL, _ROUNDS = (31, 15), 4
 """Columns and rows of the window in which the floor around a pixel is measured, and how often."""
 _NOTHING, _DENSE = 0.02, 0.5
-"""A share of a window that tells nothing, and one that ground reaches where it is matched: what only
-one camera sees is matched less, by chance.
-"""
+"""A share of a window that tells nothing, and one that ground reaches where both cameras see it:
+elsewhere some is matched by chance."""
 _BLOCK, _NEAR, _WIDE = (COARSE_BLOCK_PX, COARSE_BLOCK_PX), (5, 5), (9, 9)
 """Columns and rows of the block that is matched, and of the windows over which pixels are averaged,
 and are counted."""
