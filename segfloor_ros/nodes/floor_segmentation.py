@@ -31,6 +31,7 @@ from segfloor_ros.nodes.messages.topics import (
 )
 from segfloor_ros.nodes.settings.floor import FloorSegmentationNodeSettings
 from segfloor_ros.nodes.shared.keyframes import KeyframeJoin
+from segfloor_ros.nodes.shared.map_parts import MapPart
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
 
@@ -107,9 +108,11 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
             may_process=self._has_mount,
             optional=(MOVING_MASK, SEMANTIC_MASK),
         )
+        self._part = MapPart(self, self._keyframes, 'floor')
 
     def reset_stage(self) -> None:
         """Begin anew."""
+        self._part.reset()
         self._frame_scan.reset()
         self._camera: StereoCamera | None = None
         self._stage: FloorSegmentation | None = None
@@ -166,6 +169,7 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
 
             picture = v_disparity_picture(floor)
             out.publish('keyframe/v_disparity', image_message(*at, picture, 'bgr8'))
+        self._part.note(stamp_ns, parts[POSE].header.frame_id)
         return {'remarks': REMARKS_APART.join(remarks.values())}
 
     def find_problems(self) -> None:

@@ -7,27 +7,11 @@ from sensor_msgs.msg import TimeReference
 from segfloor_ros.nodes.messages.making import make_header, to_ns, to_time
 
 
-def map_start_message(
-    stamp_ns: int, frame_id: str, start_ns: int, is_loaded: bool = False
-) -> TimeReference:
-    """Return that the keyframe of a stamp belongs to the map that was begun at `start_ns`.
-    is_loaded: with what was loaded.
-    """
-    return TimeReference(
-        header=make_header(stamp_ns, frame_id),
-        time_ref=to_time(start_ns),
-        source=LOADED if is_loaded else BEGUN,
-    )
+def map_start_message(stamp_ns: int, frame_id: str, start_ns: int) -> TimeReference:
+    """Return that the keyframe of a stamp belongs to the map that was begun at `start_ns`."""
+    return TimeReference(header=make_header(stamp_ns, frame_id), time_ref=to_time(start_ns))
 
 
 def map_start_ns(message: TimeReference) -> int:
     """Return when the keyframe's map was begun."""
     return to_ns(message.time_ref)
-
-
-def is_of_loaded_map(message: TimeReference) -> bool:
-    """Whether the keyframe's map goes on from a file."""
-    return message.source == LOADED
-
-
-BEGUN, LOADED = 'stereo_slam', 'map file'

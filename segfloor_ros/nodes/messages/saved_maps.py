@@ -8,6 +8,9 @@ from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
 
 from segfloor_ros.core.files.arrays import MapFile
 
+LEAST_SHARE = 20
+"""Times that keeping a map took pass before it is kept again."""
+
 
 def map_file_message(saved: MapFile) -> UInt8MultiArray:
     """Return a map, or a part of one, as the bytes of its file, not compressed."""

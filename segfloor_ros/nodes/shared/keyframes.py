@@ -8,11 +8,19 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import TimeReference
 
 from segfloor_ros.nodes.messages.diagnostics import Level
-from segfloor_ros.nodes.messages.map_starts import is_of_loaded_map, map_start_ns
-from segfloor_ros.nodes.messages.topics import KEYFRAME_DONE, KEYFRAMES, MAP_START, make_header
+from segfloor_ros.nodes.messages.map_starts import map_start_ns
+from segfloor_ros.nodes.messages.topics import (
+    KEYFRAME_DONE,
+    KEYFRAMES,
+    LATCHED_BY_MANY,
+    MAP_START,
+    make_header,
+)
+from segfloor_ros.nodes.shared.inputs import CHECK_S, offered
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 
 Process = Callable[[int, dict[str, Any]], Mapping[str, Any]]
@@ -20,8 +28,9 @@ Process = Callable[[int, dict[str, Any]], Mapping[str, Any]]
 
 
 class KeyframeJoin:
-    """Joins the parts of a keyframe and has the node process them. Where SLAM tells which map a
-    keyframe belongs to, the node is reset before the first one of another map.
+    """Joins the parts of a keyframe and has the node process them, at the start of the node those
+    that publishers keep. Where SLAM tells which map a keyframe belongs to, the node is reset before
+    the first one of another map.
 
     may_process: keyframes are kept while it says no, until `process_waiting`. is_last: the
     keyframe goes no further when the node has processed it. optional: parts that are waited for
@@ -43,16 +52,19 @@ class KeyframeJoin:
         self._is_last = is_last
         self._waiting: deque[tuple[int, dict[str, Any]]] = deque(maxlen=KEYFRAMES.depth)
         self._left_ns: int | None = None
+        self._profile = LATCHED_BY_MANY
         self.map_start_ns: int | None = None
         """When the map was begun; None where nobody has said."""
-        self.is_loaded = False
-        """Whether the map goes on from a file."""
+        self.known_ns: int | None = None
+        """Keyframes up to this stamp are in the map that the node was started with."""
 
         def is_published(topic: str) -> bool:
             return bool(node.inputs.subscriptions[topic].get_publisher_count())
 
         published = {topic: partial(is_published, topic) for topic in (MAP_START, *optional)}
-        node.inputs.join(parts, self._take, optional=published)
+        self._parts = (*parts, *published)
+        node.inputs.join(parts, self._take, choose_profile=self._choose_profile, optional=published)
+        node.inputs.every(CHECK_S, self._adapt_to_offers)
 
     @property
     def waiting_count(self) -> int:
@@ -64,12 +76,14 @@ class KeyframeJoin:
         if start_ns != self.map_start_ns:
             self._waiting.clear()
             self._left_ns, self.map_start_ns = self.map_start_ns, start_ns
+            self.known_ns = None
 
     def process_waiting(self) -> None:
         """Process what is kept, as far as it may be."""
         while self._waiting and self.may_process():
             stamp_ns, parts = self._waiting.popleft()
-            is_well = self._work(stamp_ns, parts)
+            is_known = self.known_ns is not None and stamp_ns <= self.known_ns
+            is_well = is_known or self._work(stamp_ns, parts)
             if self._is_last or not is_well:
                 self._node.outputs.publish(KEYFRAME_DONE, make_header(stamp_ns, ''))
 
@@ -85,7 +99,24 @@ class KeyframeJoin:
         self._node.reporter.report_processed(stamp_ns, Level.OK, 'running', milliseconds, **values)
         return True
 
+    def _choose_profile(self) -> QoSProfile:
+        return self._profile
+
+    def _adapt_to_offers(self) -> None:
+        """Take what others publish that keep nothing."""
+        node, volatile = self._node, DurabilityPolicy.VOLATILE
+        if self._profile is KEYFRAMES:
+            return
+        found = {
+            name: node.inputs.subscriptions[name].get_publisher_count() for name in self._parts
+        }
+        others = [name for name, count in found.items() if node.count_publishers(name) > count]
+        if offered(node, others, durability=volatile):
+            self._profile = KEYFRAMES
+            node.inputs.reopen()
+
     def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
+        self._profile = KEYFRAMES  # what comes while the inputs are closed is missed
         if MAP_START in parts and not self._follow(parts[MAP_START]):
             self._node.outputs.publish(KEYFRAME_DONE, make_header(stamp_ns, ''))
             return
@@ -100,5 +131,4 @@ class KeyframeJoin:
                 return False
             self._node.reset('stereo_slam has begun a new map')
         self.leave_for(start_ns)
-        self.is_loaded = is_of_loaded_map(message)
         return True
