@@ -19,11 +19,11 @@ from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.slam.places.views import NEW_TURN_RAD
+from segfloor_ros.nodes.kept_state import KeptState
 from segfloor_ros.nodes.messages.diagnostics import Level, Status
 from segfloor_ros.nodes.messages.points import labelled_arrays
 from segfloor_ros.nodes.messages.poses import path_arrays, pose_array
-from segfloor_ros.nodes.messages.topics import CAMERA, FLOOR, GRID, SLAM, to_ns
-from segfloor_ros.nodes.shared.kept_state import KeptState
+from segfloor_ros.nodes.messages.topics import BEHIND, CAMERA, GRID, RECENT, SLAM, to_ns
 
 NEW_VIEW_RAD = 1.1 * NEW_TURN_RAD
 """Turn per frame: every one is a new view, which becomes a keyframe."""
@@ -176,7 +176,24 @@ def test_a_node_that_is_killed_goes_on_where_it_was(journey, node) -> None:
     rows = np.searchsorted(ids, both)
     assert (cloud_after.label[rows] != POINT_UNKNOWN).mean() > 0.95
     assert 'Traceback' not in chain.log(node)
-    assert ('resumed with the map' in chain.log(node)) == (node != FLOOR)
+    assert 'resumed with the map' in chain.log(node)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('node', BEHIND)
+def test_keyframes_that_come_while_a_node_is_away_reach_the_map(journey, node) -> None:
+    chain = journey.chain
+    journey.keyframes(1)
+    chain.kill(node)
+    answers = [journey.step() for _ in range(RECENT.depth // 2)]
+    chain.start(node)
+    stamps = [answer.stamp_ns for answer in answers if answer.values['keyframe'] == '1']
+    assert len(stamps) >= 2
+    for stamp_ns in stamps:
+        chain.mapped(stamp_ns)
+    path = path_arrays(journey.latest('keyframe/path')).stamp_ns
+    failed = {s.stamp_ns for s in chain.graph.reports(GRID) if s.level is not Level.OK}
+    assert not failed & {*stamps, *path.tolist()}
 
 
 @pytest.mark.slow
@@ -302,23 +319,15 @@ def test_what_is_kept_is_found_once_by_the_same_user_and_only_for_a_while(own_fo
     assert not file.exists()
 
 
-def test_what_came_too_soon_after_the_last_is_kept_when_it_is_time(own_folder) -> None:
-    """A robot that stands makes no keyframe that would keep the one before."""
+def test_what_is_kept_is_kept_again_when_it_is_time(own_folder) -> None:
     kept = KeptState('/robot/stereo_slam', 30.0)
     keep(kept)
-    keep(kept, 2)
+    keep(kept, 2)  # too soon after the last one
     deadline_s = time.monotonic() + 20
     while not kept.is_due and time.monotonic() < deadline_s:
         time.sleep(0.01)
-    kept.catch_up()
-    kept.finish()
-    assert kept_value(kept) == 2
-    kept.catch_up()
-    assert kept_value(kept) is None, 'once'
     keep(kept, 3)
-    kept.remove()
-    kept.catch_up()
-    assert kept_value(kept) is None, 'what is removed does not come back'
+    assert kept_value(kept) == 3
 
 
 def test_what_a_killed_node_leaves_does_not_reach_the_next_graph(monkeypatch) -> None:
