@@ -13,7 +13,9 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import CameraInfo
 
 from segfloor_ros.core.camera.calibration import StereoCalibration
@@ -26,7 +28,7 @@ from segfloor_ros.core.errors import InputError
 from segfloor_ros.nodes.messages.camera_infos import same_calibration
 from segfloor_ros.nodes.messages.topics import IMAGES, KEYFRAMES, LATCHED, PATIENCE_S, best_effort
 from segfloor_ros.nodes.settings.slam import StereoSlamNodeSettings
-from segfloor_ros.nodes.shared.inputs import DISCOVERY_S, offered
+from segfloor_ros.nodes.shared.inputs import DISCOVERY_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 
 CATCH_UP = 0.2
@@ -300,3 +302,14 @@ class StereoInput:
             text = f'{topic}: the calibration is not the one in use; ~/reset takes it over'
             self._node.reporter.diagnose(f'calibration on {topic}', text, lasts_s=PATIENCE_S)
         self._on_news()
+
+
+def offered(node: Node, topics: Iterable[str], **policies: object) -> list[str]:
+    """Return the topics that somebody publishes with some policies, e.g. best effort, which reaches
+    no reliable listener.
+    """
+
+    def offers(info: TopicEndpointInfo) -> bool:
+        return all(getattr(info.qos_profile, name) == one for name, one in policies.items())
+
+    return [t for t in topics if any(map(offers, node.get_publishers_info_by_topic(t)))]

@@ -15,7 +15,7 @@ from std_msgs.msg import UInt8MultiArray
 
 from segfloor_ros.core.contracts import LoadedMap
 from segfloor_ros.core.errors import MapError, SettingsError
-from segfloor_ros.core.files.arrays import Arrays, MapFile
+from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.files.paths import user_path
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.nodes.kept_state import KeptState
@@ -44,11 +44,11 @@ class SlamMaps:
         self._slam = slam
         self.kept = KeptState(node.get_fully_qualified_name(), self._own.resume_within_s)
         node.outputs.at_clean_up(self.kept.remove)
-        self._kept_ns: dict[str, int] = {}
+        self._kept_ns: list[int] = []
         self._parts: dict[str, MapFile] = {}
         """What the nodes behind know, by name; each with the map that it belongs to."""
         self._asked: dict[str, int] = {}
-        self._is_to_send = False
+        self._is_to_answer = False
         self._wanted: tuple[int, int] | None = None
         """Map and keyframe of the parts that are waited for."""
         self._arrived: Future | None = None
@@ -77,65 +77,46 @@ class SlamMaps:
         """Hold what the nodes behind know of a map that SLAM goes on with. last_ns: the latest
         keyframe in each part.
         """
+        belongs = {'start_ns': self._topics.map_start_ns, 'frame_id': self._own.map_frame}
         for name, stamp_ns in last_ns.items():
-            header = {
-                'part': name,
-                'start_ns': self._topics.map_start_ns,
-                'last_ns': stamp_ns,
-                'frame_id': self._own.map_frame,
-            }
-            self._parts[name] = MapFile(header, {name: saved.parts[name]} if name in PARTS else {})
-        self._is_to_send = True
+            parts = {name: saved.parts[name]} if name in saved.parts else {}
+            self._parts[name] = MapFile(belongs | {'part': name, 'last_ns': stamp_ns}, parts)
+        self._is_to_answer = True
 
     def hold_loaded(self, saved: MapFile, loaded: LoadedMap) -> None:
         """Hold what the nodes behind need of a map that was loaded."""
-        grid = saved.parts['grid']
+        grid, cloud = saved.parts['grid'], loaded.cloud
         saved.parts['grid'] = grid | {'stamp_ns': grid['stamp_ns'] + loaded.shift_ns}
         self.hold(saved, dict.fromkeys(sorted(PARTS), int(loaded.path.stamp_ns[-1])))
-        points = {'point_id': loaded.cloud.point_id, 'xyz_map': loaded.cloud.xyz_map}
+        points = {'point_id': cloud.point_id, 'xyz_map': cloud.xyz_map}
         self._parts['cloud'].parts['points'] = points
 
     def work(self) -> None:
         """Answer the nodes that have asked, and keep what a later life of this node goes on from,
         where there are new keyframes.
         """
-        if self._is_to_send:
-            self._is_to_send = False
-            header = {
-                'start_ns': self._topics.map_start_ns,
-                'frame_id': self._own.map_frame,
-                'last_ns': self._last_ns,
-                'asked': self._asked,
-            }
-            saved = MapFile(header, self._current_parts())
-            self._node.outputs.publish(MAP_LOADED, map_file_message(saved))
+        if self._is_to_answer:
+            self._is_to_answer = False
+            start_ns, frame_id = self._topics.map_start_ns, self._own.map_frame
+            header = {'start_ns': start_ns, 'frame_id': frame_id, 'asked': self._asked}
+            answer = self._with_parts(MapFile(header))
+            self._node.outputs.publish(MAP_LOADED, map_file_message(answer))
         slam = self._slam()
         if slam is None or slam.mount is None or not slam.map.keyframes or self._own.localize:
             return
-        newest = self._last_ns | {'slam': slam.map.keyframes[-1].stamp_ns}
+        newest = [slam.map.keyframes[-1].stamp_ns]
+        newest += [part.header['last_ns'] for part in self._parts.values()]
         if newest != self._kept_ns and slam.back_end.idle and self.kept.is_due:
-            self.kept.save(self._whole)
+            self.kept.save(lambda: self._with_parts(self._slam_part()))
             self._kept_ns = newest
 
-    @property
-    def _current(self) -> list[MapFile]:
-        """The parts that belong to the map."""
-        start_ns = self._topics.map_start_ns
-        return [part for part in self._parts.values() if part.header['start_ns'] == start_ns]
-
-    @property
-    def _last_ns(self) -> dict[str, int]:
-        """The latest keyframe in each part."""
-        return {part.header['part']: part.header['last_ns'] for part in self._current}
-
-    def _current_parts(self) -> dict[str, Arrays]:
-        return {name: arrays for part in self._current for name, arrays in part.parts.items()}
-
-    def _whole(self) -> MapFile:
-        """Return the map with what the nodes behind know of it."""
-        saved = self._slam_part()
-        saved.header['last_ns'] = self._last_ns
-        saved.parts |= self._current_parts()
+    def _with_parts(self, saved: MapFile) -> MapFile:
+        """Add what the nodes behind know of the map, and the latest keyframe in each part."""
+        saved.header['last_ns'] = {}
+        for name, part in self._parts.items():
+            if part.header['start_ns'] == self._topics.map_start_ns:
+                saved.header['last_ns'][name] = part.header['last_ns']
+                saved.parts |= part.parts
         return saved
 
     def _slam_part(self) -> MapFile:
@@ -253,7 +234,7 @@ class SlamMaps:
         name, start_ns = part.header['part'], part.header['start_ns']
         self._asked[name] = part.header['asked']
         if start_ns is None:
-            self._is_to_send = True
+            self._is_to_answer = True
         elif not part.header['frame_id']:
             self._parts.pop(name, None)
         else:

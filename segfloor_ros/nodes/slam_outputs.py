@@ -23,7 +23,7 @@ from segfloor_ros.nodes.messages import points, poses
 from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART, Level
 from segfloor_ros.nodes.messages.images import image_message
-from segfloor_ros.nodes.messages.map_starts import map_start_message
+from segfloor_ros.nodes.messages.saved_maps import map_start_message
 from segfloor_ros.nodes.messages.topics import (
     CORRECTED,
     FRAME_PARTS,

@@ -39,9 +39,10 @@ from segfloor_ros.nodes.messages.topics import (
     best_effort,
     to_ns,
 )
-from segfloor_ros.nodes.shared.inputs import DISCOVERY_S, LOOK_S, offered
+from segfloor_ros.nodes.shared.inputs import DISCOVERY_S, LOOK_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
+from segfloor_ros.nodes.slam_camera import offered
 
 WHEELS, IMU, TF_WHEELS = 'wheel_odometry', 'imu', 'odom → base_link'
 MASKS, INITIAL_POSE = 'dynamic_mask', 'initialpose'

@@ -11,9 +11,8 @@ from std_srvs.srv import Trigger
 
 from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.messages.map_starts import map_start_message
 from segfloor_ros.nodes.messages.points import labelled_arrays
-from segfloor_ros.nodes.messages.saved_maps import map_file_message, map_file_of
+from segfloor_ros.nodes.messages.saved_maps import map_file_message, map_file_of, map_start_message
 from segfloor_ros.nodes.messages.topics import KEYFRAMES, MAP_LOADED, MAP_PART, MAP_START, TOPICS
 
 S = 1_000_000_000
@@ -104,15 +103,19 @@ def test_a_node_that_is_started_again_has_lost_nothing(keeper) -> None:
     assert not keeper.graph.comes(lambda: len(keeper.labelled) > 2, 0.3)
 
 
-def test_a_node_asks_anew_for_a_map_that_it_does_not_know(keeper) -> None:
+def test_a_node_is_reset_when_the_keyframes_are_of_another_map(keeper) -> None:
+    """It asks for that one, which it does not know."""
     keeper.graph.add(CloudLabellingNode())
     keeper.answer(keeper.asked(1))
-    keeper.send(1)
-    keeper.confidence(1)
-    keeper.send(2, start_ns=BEGUN + 1)
+    for number in (1, 2):
+        keeper.send(number)
+        keeper.confidence(number)
+    keeper.send(3, start_ns=BEGUN + 1)
     keeper.answer(keeper.asked(2), start_ns=BEGUN + 1)
-    first, second = (keeper.confidence(2), labelled_arrays(keeper.labelled[0], '').confidence)
-    np.testing.assert_array_equal(first, second)
+    keeper.confidence(3)
+    first, second, third = (labelled_arrays(m, '').confidence for m in keeper.labelled)
+    assert not np.array_equal(first, second)
+    np.testing.assert_array_equal(first, third)
 
 
 def test_what_a_reset_has_dropped_does_not_come_back(keeper) -> None:

@@ -240,17 +240,10 @@ _ALL = [
     Topic(FRAME_DONE, Header, KEYFRAMES, SLAM),
     Topic('camera_mount', TransformStamped, LATCHED, SLAM, (FLOOR, MASKS)),
     Topic('keyframe/odometry', Odometry, KEYFRAMES, SLAM, BEHIND),
-    # Whoever sees that keyframes name their map sees who keeps it: publishers are found in order.
     Topic(MAP_LOADED, UInt8MultiArray, LATCHED, SLAM, BEHIND, is_optional=True),
     Topic(MAP_START, TimeReference, KEYFRAMES, SLAM, BEHIND, is_optional=True),
     Topic(
-        MAP_PART,
-        UInt8MultiArray,
-        LATCHED_BY_MANY,
-        FLOOR,
-        (SLAM,),
-        is_optional=True,
-        also_by=(CLOUD, GRID),
+        MAP_PART, UInt8MultiArray, LATCHED_BY_MANY, FLOOR, (SLAM,), is_optional=True, also_by=BEHIND
     ),
     *_rectified_pair(KEYFRAME_PARTS, KEYFRAMES, of_right=(FLOOR,), of_left=(FLOOR, MASKS)),
     *_rectified_pair(FRAME_PARTS, FRAMES, is_optional=True, on_demand_by=(FLOOR,)),

@@ -4,7 +4,7 @@ stereo pair, joined by their stamps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -15,7 +15,6 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from segfloor_ros.nodes.messages.topics import TOPICS, stamp_of, to_ns
 from segfloor_ros.nodes.shared.joining import StampJoiner
@@ -225,14 +224,3 @@ def _waiting(subscription: Subscription, most: int) -> Iterator[tuple[Any, Mappi
             if message is None:
                 return
             yield message
-
-
-def offered(node: Node, topics: Iterable[str], **policies: object) -> list[str]:
-    """Return the topics that somebody publishes with some policies, e.g. best effort, which reaches
-    no reliable listener.
-    """
-
-    def offers(info: TopicEndpointInfo) -> bool:
-        return all(getattr(info.qos_profile, name) == one for name, one in policies.items())
-
-    return [t for t in topics if any(map(offers, node.get_publishers_info_by_topic(t)))]

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy
 from sensor_msgs.msg import TimeReference
 
-from segfloor_ros.nodes.messages.diagnostics import Level
-from segfloor_ros.nodes.messages.map_starts import map_start_ns
+from segfloor_ros.nodes.messages.diagnostics import HEALTH_PERIOD_S, Level
+from segfloor_ros.nodes.messages.saved_maps import map_start_ns
 from segfloor_ros.nodes.messages.topics import (
     KEYFRAME_DONE,
     KEYFRAMES,
@@ -20,7 +21,6 @@ from segfloor_ros.nodes.messages.topics import (
     MAP_START,
     make_header,
 )
-from segfloor_ros.nodes.shared.inputs import CHECK_S, offered
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 
 Process = Callable[[int, dict[str, Any]], Mapping[str, Any]]
@@ -55,7 +55,7 @@ class KeyframeJoin:
         self._profile = LATCHED_BY_MANY
         self.map_start_ns: int | None = None
         """When the map was begun; None where nobody has said."""
-        self.known_ns: int | None = None
+        self.known_ns = -math.inf
         """Keyframes up to this stamp are in the map that the node was started with."""
 
         def is_published(topic: str) -> bool:
@@ -63,8 +63,10 @@ class KeyframeJoin:
 
         published = {topic: partial(is_published, topic) for topic in (MAP_START, *optional)}
         self._parts = (*parts, *published)
-        node.inputs.join(parts, self._take, choose_profile=self._choose_profile, optional=published)
-        node.inputs.every(CHECK_S, self._adapt_to_offers)
+        node.inputs.join(
+            parts, self._take, choose_profile=lambda: self._profile, optional=published
+        )
+        node.inputs.every(HEALTH_PERIOD_S, self._adapt_to_offers)
 
     @property
     def waiting_count(self) -> int:
@@ -76,14 +78,13 @@ class KeyframeJoin:
         if start_ns != self.map_start_ns:
             self._waiting.clear()
             self._left_ns, self.map_start_ns = self.map_start_ns, start_ns
-            self.known_ns = None
+            self.known_ns = -math.inf
 
     def process_waiting(self) -> None:
         """Process what is kept, as far as it may be."""
         while self._waiting and self.may_process():
             stamp_ns, parts = self._waiting.popleft()
-            is_known = self.known_ns is not None and stamp_ns <= self.known_ns
-            is_well = is_known or self._work(stamp_ns, parts)
+            is_well = stamp_ns <= self.known_ns or self._work(stamp_ns, parts)
             if self._is_last or not is_well:
                 self._node.outputs.publish(KEYFRAME_DONE, make_header(stamp_ns, ''))
 
@@ -99,21 +100,13 @@ class KeyframeJoin:
         self._node.reporter.report_processed(stamp_ns, Level.OK, 'running', milliseconds, **values)
         return True
 
-    def _choose_profile(self) -> QoSProfile:
-        return self._profile
-
     def _adapt_to_offers(self) -> None:
         """Take what others publish that keep nothing."""
-        node, volatile = self._node, DurabilityPolicy.VOLATILE
-        if self._profile is KEYFRAMES:
-            return
-        found = {
-            name: node.inputs.subscriptions[name].get_publisher_count() for name in self._parts
-        }
-        others = [name for name, count in found.items() if node.count_publishers(name) > count]
-        if offered(node, others, durability=volatile):
+        look = self._node.get_publishers_info_by_topic
+        offered = {info.qos_profile.durability for name in self._parts for info in look(name)}
+        if self._profile is not KEYFRAMES and DurabilityPolicy.VOLATILE in offered:
             self._profile = KEYFRAMES
-            node.inputs.reopen()
+            self._node.inputs.reopen()
 
     def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
         self._profile = KEYFRAMES  # what comes while the inputs are closed is missed

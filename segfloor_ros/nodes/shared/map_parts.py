@@ -48,12 +48,12 @@ class MapPart:
         self._may_process, keyframes.may_process = keyframes.may_process, self._is_here
 
     def reset(self) -> None:
-        """Belong to a map of which nothing is known yet."""
+        """Belong to a map of which nothing is known yet, and ask SLAM where there is none."""
         if not self._is_sent:
             self._send()
         self.last_ns, self.frame_id = 0, ''
         self._start_ns = self._keyframes.map_start_ns
-        self._send(is_empty=True)
+        self._send()
 
     def note(self, stamp_ns: int, frame_id: str) -> None:
         """Note that a keyframe is in the map, and have SLAM keep the part."""
@@ -62,34 +62,28 @@ class MapPart:
 
     def _is_here(self) -> bool:
         """Whether all is known that SLAM keeps of the map of the keyframes; asks for it."""
-        start_ns, keeper = self._keyframes.map_start_ns, self._node.inputs.subscriptions[MAP_LOADED]
-        if start_ns != self._start_ns:
-            if keeper.get_publisher_count():
-                if self._start_ns is not None or not self._asked:
-                    self._start_ns = None
-                    self._send(is_empty=True)
-                return False
-            self._start_ns = start_ns
-        return self._may_process()
+        if self._keyframes.map_start_ns == self._start_ns:
+            return self._may_process()
+        if self._start_ns is not None:
+            self._start_ns = None
+            self._send()
+        return False
 
     def _keep(self) -> None:
         """Send what is new, once it is time."""
         if not self._is_sent and time.monotonic() >= self._next_s:
             self._send()
 
-    def _send(self, is_empty: bool = False) -> None:
-        """Send the part, or none: where the map is not known, that asks for what SLAM keeps."""
+    def _send(self) -> None:
+        """Send the part, if there is one; where the map is not known, that asks for it."""
         begun_s = time.monotonic()
         if self._start_ns is None:
             self._asked = time.time_ns()
         header = {
-            'part': self._name,
-            'start_ns': self._start_ns,
-            'asked': self._asked,
-            'last_ns': self.last_ns,
-            'frame_id': self.frame_id,
-        }
-        parts = {} if is_empty else {self._name: self._arrays()}
+            'part': self._name, 'start_ns': self._start_ns, 'asked': self._asked,
+            'last_ns': self.last_ns, 'frame_id': self.frame_id,
+        }  # fmt: skip
+        parts = {self._name: self._arrays()} if self.frame_id else {}
         self._node.outputs.publish(MAP_PART, map_file_message(MapFile(header, parts)))
         now_s = time.monotonic()
         self._is_sent, self._next_s = True, now_s + LEAST_SHARE * (now_s - begun_s)
@@ -97,17 +91,17 @@ class MapPart:
     def _take(self, message: UInt8MultiArray) -> None:
         """Go on with what SLAM keeps or has loaded, where it is the answer, or another map."""
         saved = map_file_of(message, MAP_LOADED)
-        start_ns, answers = saved.header['start_ns'], saved.header['asked']
-        is_meant = answers.get(self._name) == self._asked or self._start_ns is not None
-        if start_ns == self._start_ns or not is_meant:
+        header, name = saved.header, self._name
+        is_meant = self._start_ns is not None or header['asked'].get(name) == self._asked
+        if header['start_ns'] == self._start_ns or not is_meant:
             return
         if self.frame_id:
             self._node.reset('stereo_slam goes on with another map')
-        self._keyframes.leave_for(start_ns)
-        self._start_ns = start_ns
-        if self._name in saved.header['last_ns']:
-            self.last_ns = self._keyframes.known_ns = saved.header['last_ns'][self._name]
-            self.frame_id = saved.header['frame_id']
+        self._keyframes.leave_for(header['start_ns'])
+        self._start_ns = header['start_ns']
+        if name in header['last_ns']:
+            self.last_ns, self.frame_id = header['last_ns'][name], header['frame_id']
+            self._keyframes.known_ns = self.last_ns
             self._restore(saved)
             self._node.get_logger().warning('resumed with the map that stereo_slam keeps')
         self._keyframes.process_waiting()
