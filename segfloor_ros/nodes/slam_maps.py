@@ -49,10 +49,8 @@ class SlamMaps:
         """What the nodes behind know, by name; each with the map that it belongs to."""
         self._asked: dict[str, int] = {}
         self._is_to_answer = False
-        self._wanted: tuple[int, int] | None = None
-        """Map and keyframe of the parts that are waited for."""
         self._arrived: Future | None = None
-        self._gathered: dict[str, MapFile] = {}
+        """Done when a map that is saved has all its parts."""
         node.inputs.subscribe(MAP_PART, self._take_part)
         node.outputs.trigger('~/save_map', self._save)
         node.outputs.trigger('~/load_map', self._load)
@@ -195,34 +193,31 @@ class SlamMaps:
         path = self._file_to_save()
         check_output(path, SAVED_MAP, (self._own.load_map,), 'save_map')
         saved = self._slam_part()
-        last_ns = int(saved.parts['slam']['keyframe_stamp_ns'][-1])
-        self._wanted, self._arrived = (saved.header['start_ns'], last_ns), Future()
+        self._saved, self._arrived = saved, Future()
         for part in self._parts.values():
             self._gather(part)
         return path, saved
 
     async def _completed(self, path: Path, saved: MapFile) -> str:
         """Save a map once the parts of the other nodes have come; returns where it is."""
-        saved.header.pop('start_ns')
         arrived = self._arrived
         assert arrived is not None
         give_up = self._node.inputs.steady_timer(PATIENCE_S, self._give_up)
         try:
             await arrived
-            for name, part in self._gathered.items():
-                saved.parts[name] = part.parts[name]
+            del saved.header['start_ns']
             from segfloor_ros.core.files.results import write_map_file
 
             inputs = (self._own.load_map,)
             await _in_background(partial(write_map_file, path, saved, inputs))
         finally:
             self._node.destroy_timer(give_up)
-            self._arrived, self._gathered = None, {}
+            self._arrived = None
         return str(path)
 
     def _give_up(self) -> None:
         if self._arrived is not None and not self._arrived.done():
-            missing = ', '.join(sorted(PARTS - self._gathered.keys()))
+            missing = ', '.join(sorted(PARTS - self._saved.parts.keys()))
             text = (
                 f'the map is not saved: within {PATIENCE_S:g} s no answer on {MAP_PART} of the '
                 f'part {missing}; are cloud_labelling and occupancy_grid active?'
@@ -242,15 +237,14 @@ class SlamMaps:
             self._gather(part)
 
     def _gather(self, part: MapFile) -> None:
-        """Take a part that a save waits for."""
-        name, header = part.header['part'], part.header
-        if self._arrived is None or self._arrived.done() or name not in PARTS:
+        """Take a part that a save waits for: of its map, with its last keyframe."""
+        if self._arrived is None or self._arrived.done():
             return
-        assert self._wanted is not None
-        start_ns, last_ns = self._wanted
-        if header['start_ns'] == start_ns and header['last_ns'] >= last_ns:
-            self._gathered[name] = part
-        if self._gathered.keys() >= PARTS:
+        saved, header, name = self._saved, part.header, part.header['part']
+        is_new = header['last_ns'] >= saved.parts['slam']['keyframe_stamp_ns'][-1]
+        if name in PARTS and is_new and header['start_ns'] == saved.header['start_ns']:
+            saved.parts[name] = part.parts[name]
+        if saved.parts.keys() >= PARTS:
             self._arrived.set_result(None)
 
 

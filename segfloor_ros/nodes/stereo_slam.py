@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.contracts import Mount, StereoFrame
+from segfloor_ros.core.contracts import LastPose, LoadedMap, Mount, StereoFrame
 from segfloor_ros.core.errors import InputError, about
 from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE, StereoSlam
@@ -66,13 +66,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         if kept is not None:
             self._resume(kept)
         elif saved is not None:
-            from segfloor_ros.core.plugins.maps.saved_slam import load_slam, saved_camera
-
-            name, own = self.settings.load_map, self.settings
-            camera = saved_camera(saved, name)
-            self.slam = self._make_slam(camera)
-            self._maps.hold_loaded(saved, load_slam(self.slam, camera, saved, name, own.localize))
-            self._keep_axes(saved)
+            self._maps.hold_loaded(saved, self._load(saved, self.settings.load_map))
 
     def reset(self, reason: str) -> None:
         """Drop the map, which is saved first where `save_map` names a file."""
@@ -84,25 +78,26 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         """Go on with the map of a killed node: with its stamps, and where it ended. Raises
         InputError.
         """
-        from segfloor_ros.core.plugins.maps.saved_slam import last_pose_of, load_slam, saved_camera
+        from segfloor_ros.core.plugins.maps.saved_slam import last_pose_of
 
         last = last_pose_of(saved.header.get('note', {}))
         self._results.reset(saved.header['start_ns'])
-        camera = saved_camera(saved, 'kept map')
-        self.slam = self._make_slam(camera)
-        load_slam(self.slam, camera, saved, 'kept map', last=last)
-        self._keep_axes(saved)
+        self._load(saved, 'kept map', last)
         self._maps.hold(saved, saved.header['last_ns'])
         self._stamps = StampOrder(last.stamp_ns)
         self._is_resumed = True
         self.get_logger().warning('resumed with the map of a node that was killed')
 
-    def _keep_axes(self, saved: MapFile) -> None:
-        """Let poses alone have the axes that they had in a saved map."""
-        if self.slam is not None and self.settings.path_only:
-            from segfloor_ros.core.plugins.maps.saved_slam import base_of
+    def _load(self, saved: MapFile, name: str, last: LastPose | None = None) -> LoadedMap:
+        """Make SLAM that goes on with a map; poses alone have the axes that they had in it."""
+        from segfloor_ros.core.plugins.maps.saved_slam import base_of, load_slam, saved_camera
 
+        own, camera = self.settings, saved_camera(saved, name)
+        self.slam = self._make_slam(camera)
+        loaded = load_slam(self.slam, camera, saved, name, own.localize and last is None, last)
+        if own.path_only:
             self.slam.rig.base = base_of(saved)
+        return loaded
 
     def is_needed_otherwise(self) -> bool:
         """Whether anybody listens to tf."""
