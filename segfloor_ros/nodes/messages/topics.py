@@ -240,8 +240,8 @@ _ALL = [
     Topic(FRAME_DONE, Header, KEYFRAMES, SLAM),
     Topic('camera_mount', TransformStamped, LATCHED, SLAM, (FLOOR, MASKS)),
     Topic('keyframe/odometry', Odometry, KEYFRAMES, SLAM, BEHIND),
-    Topic(MAP_LOADED, UInt8MultiArray, LATCHED, SLAM, BEHIND, is_optional=True),
     Topic(MAP_START, TimeReference, KEYFRAMES, SLAM, BEHIND, is_optional=True),
+    Topic(MAP_LOADED, UInt8MultiArray, LATCHED, SLAM, BEHIND, is_optional=True),
     Topic(
         MAP_PART, UInt8MultiArray, LATCHED_BY_MANY, FLOOR, (SLAM,), is_optional=True, also_by=BEHIND
     ),
