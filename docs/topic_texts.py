@@ -65,8 +65,8 @@ ABOUT = {
         'The keyframe, and as time_ref when its map began: another time_ref is another map.'
     ),
     'map_file/loaded': (
-        'What stereo_slam keeps of the nodes behind it, as the bytes of a map file: when one of them '
-        'asks for it, and when a map is loaded.'
+        'What stereo_slam keeps of the nodes behind it, as the bytes of a map file: when one of '
+        'them asks for it, and when a map is loaded.'
     ),
     'map_file/part': (
         'What a node knows of the map, as the bytes of a map file; from a node that does not know '
