@@ -23,7 +23,8 @@ from segfloor_ros.nodes.kept_state import KeptState
 from segfloor_ros.nodes.messages.diagnostics import Level, Status
 from segfloor_ros.nodes.messages.points import labelled_arrays
 from segfloor_ros.nodes.messages.poses import path_arrays, pose_array
-from segfloor_ros.nodes.messages.topics import BEHIND, CAMERA, GRID, SLAM, to_ns
+from segfloor_ros.nodes.messages.saved_maps import map_file_of
+from segfloor_ros.nodes.messages.topics import BEHIND, CAMERA, GRID, MAP_PART, SLAM, to_ns
 
 NEW_VIEW_RAD = 1.1 * NEW_TURN_RAD
 """Turn per frame: every one is a new view, which becomes a keyframe."""
@@ -32,7 +33,7 @@ PLACES = 110
 """More than are driven past: a place that is seen again makes no keyframe."""
 STEP_M = 0.05
 FRAME_NS = 100_000_000
-RECEIVED = ('map', 'labelled_points', 'odometry', 'pose', 'keyframe/path')
+RECEIVED = ('map', 'labelled_points', 'odometry', 'pose', 'keyframe/path', MAP_PART)
 REJOIN_S = 60.0
 
 
@@ -192,7 +193,9 @@ def test_keyframes_that_come_while_a_node_is_away_reach_the_map(journey, node) -
     chain.start(node)
 
     def mapped() -> set[int]:
-        return {s.stamp_ns for s in chain.graph.reports(GRID) if s.level is Level.OK}
+        parts = (map_file_of(message, MAP_PART) for message in reversed(journey.received(MAP_PART)))
+        grid = next((part.parts['grid'] for part in parts if 'grid' in part.parts), {})
+        return set(grid.get('stamp_ns', np.zeros(0)).tolist())
 
     chain.graph.until(lambda: mapped() >= set(stamps), 'all keyframes in the map')
 
