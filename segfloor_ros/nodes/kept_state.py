@@ -60,13 +60,13 @@ class KeptState:
             written.write_text(json.dumps(values))
             written.replace(self._note)
 
-    def save(self, make: Callable[[], MapFile]) -> None:
+    def save(self, make: Callable[[], MapFile], spent_s: float = 0.0) -> None:
         """Keep what `make` returns in place of the last map, where that was not kept only just now;
         it is written beside the work of the node. A full disk is no reason to stop: the older map
-        stays.
+        stays. spent_s: that the map has taken already.
         """
         if self.is_due:
-            start_s = time.monotonic()
+            start_s = time.monotonic() - spent_s
             self._writing = threading.Thread(target=self._write, args=(make(), start_s))
             self._writing.start()
 
@@ -74,11 +74,11 @@ class KeptState:
         with contextlib.suppress(OSError):
             self.file.parent.mkdir(mode=0o700, exist_ok=True)
             self._check_private()
-            from segfloor_ros.core.files.results import write_to
+            from segfloor_ros.core.files.results import to_bytes
 
             written = self.file.with_suffix('.part')
-            with written.open('wb') as file:
-                write_to(file, saved, compress=False)
+            # At once: each write to the file waits for Python's lock, which tracking holds.
+            written.write_bytes(to_bytes(saved, compress=False))
             written.replace(self.file)
         now_s = time.monotonic()
         self._next_save_s = now_s + LEAST_SHARE * (now_s - start_s)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -45,13 +46,20 @@ class SlamMaps:
         self.kept = KeptState(node.get_fully_qualified_name(), self._own.resume_within_s)
         node.outputs.at_clean_up(self.kept.remove)
         self._kept_ns: list[int] = []
+        self._to_keep: MapFile | None = None
+        """SLAM's own part of a map that is kept once the nodes behind have all its keyframes."""
+        self._to_keep_ns = 0
+        self._making_s = self._wait_until_s = 0.0
+        self._silent: set[str] = set()
+        """Nodes behind that were waited for in vain; they have sent nothing since."""
         self._parts: dict[str, MapFile] = {}
         """What the nodes behind know, by name; each with the map that it belongs to."""
         self._asked: dict[str, int] = {}
         self._is_to_answer = False
         self._arrived: Future | None = None
         """Done when a map that is saved has all its parts."""
-        node.inputs.subscribe(MAP_PART, self._take_part)
+        # On a busy machine only one message of each topic is taken per frame.
+        node.inputs.subscribe(MAP_PART, self._take_part, takes_all=True)
         node.outputs.trigger('~/save_map', self._save)
         node.outputs.trigger('~/load_map', self._load)
         node.outputs.trigger('~/prune_map', self._prune)
@@ -81,6 +89,13 @@ class SlamMaps:
             self._parts[name] = MapFile(belongs | {'part': name, 'last_ns': stamp_ns}, parts)
         self._is_to_answer = True
 
+    def hold_kept(self, saved: MapFile) -> None:
+        """Hold what the nodes behind know of the map of a killed node. Its keyframes are not sent
+        again, so that a part which was not waited for has all that it can have.
+        """
+        last_ns = saved.header['last_ns'].items()
+        self.hold(saved, {name: max(stamp_ns, _last_ns(saved)) for name, stamp_ns in last_ns})
+
     def hold_loaded(self, saved: MapFile, loaded: LoadedMap) -> None:
         """Hold what the nodes behind need of a map that was loaded."""
         grid, cloud = saved.parts['grid'], loaded.cloud
@@ -102,11 +117,37 @@ class SlamMaps:
         slam = self._slam()
         if slam is None or slam.mount is None or not slam.map.keyframes or self._own.localize:
             return
-        newest = [slam.map.keyframes[-1].stamp_ns]
-        newest += [part.header['last_ns'] for part in self._parts.values()]
-        if newest != self._kept_ns and slam.back_end.idle and self.kept.is_due:
-            self.kept.save(lambda: self._with_parts(self._slam_part()))
-            self._kept_ns = newest
+        slam_ns = slam.map.keyframes[-1].stamp_ns
+        is_new = self._newest_ns(slam_ns) != self._kept_ns
+        if self._to_keep is None and is_new and slam.back_end.idle and self.kept.is_due:
+            begun_s = time.monotonic()
+            self._to_keep_ns = slam_ns
+            self._to_keep = self._slam_part()
+            self._making_s = time.monotonic() - begun_s
+            self._wait_until_s = begun_s + PATIENCE_S
+        self._keep()
+
+    def _newest_ns(self, slam_ns: int) -> list[int]:
+        return [slam_ns, *(part.header['last_ns'] for part in self._parts.values())]
+
+    def _keep(self) -> None:
+        """Keep a map once the nodes behind have its keyframes: when all are killed, nobody sends
+        them again. A node that does not answer for `PATIENCE_S` is not waited for.
+        """
+        saved = self._to_keep
+        if saved is None:
+            return
+        if saved.header['start_ns'] != self._topics.map_start_ns:
+            self._to_keep = None
+            return
+        covering = {name for name, part in self._parts.items() if _covers(part, saved)}
+        missing = self._asked.keys() - covering - self._silent
+        if missing and time.monotonic() < self._wait_until_s:
+            return
+        self._silent |= missing
+        self._to_keep = None
+        self._kept_ns = self._newest_ns(self._to_keep_ns)
+        self.kept.save(lambda: self._with_parts(saved), self._making_s)
 
     def _with_parts(self, saved: MapFile) -> MapFile:
         """Add what the nodes behind know of the map, and the latest keyframe in each part."""
@@ -228,6 +269,7 @@ class SlamMaps:
         part = map_file_of(message, MAP_PART)
         name, start_ns = part.header['part'], part.header['start_ns']
         self._asked[name] = part.header['asked']
+        self._silent.discard(name)
         if start_ns is None:
             self._is_to_answer = True
         elif not part.header['frame_id']:
@@ -235,17 +277,28 @@ class SlamMaps:
         else:
             self._parts[name] = part
             self._gather(part)
+            self._keep()
 
     def _gather(self, part: MapFile) -> None:
         """Take a part that a save waits for: of its map, with its last keyframe."""
         if self._arrived is None or self._arrived.done():
             return
-        saved, header, name = self._saved, part.header, part.header['part']
-        is_new = header['last_ns'] >= saved.parts['slam']['keyframe_stamp_ns'][-1]
-        if name in PARTS and is_new and header['start_ns'] == saved.header['start_ns']:
+        saved, name = self._saved, part.header['part']
+        if name in PARTS and _covers(part, saved):
             saved.parts[name] = part.parts[name]
         if saved.parts.keys() >= PARTS:
             self._arrived.set_result(None)
+
+
+def _last_ns(saved: MapFile) -> int:
+    """Return the stamp of the latest keyframe of SLAM's part."""
+    return int(saved.parts['slam']['keyframe_stamp_ns'][-1])
+
+
+def _covers(part: MapFile, saved: MapFile) -> bool:
+    """Return whether a part has all keyframes of SLAM's part, of the same map."""
+    is_of_map = part.header['start_ns'] == saved.header['start_ns']
+    return is_of_map and part.header['last_ns'] >= _last_ns(saved)
 
 
 async def _in_background(work: Callable[[], None]) -> None:

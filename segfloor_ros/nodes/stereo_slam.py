@@ -83,7 +83,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         last = last_pose_of(saved.header.get('note', {}))
         self._results.reset(saved.header['start_ns'])
         self._load(saved, 'kept map', last)
-        self._maps.hold(saved, saved.header['last_ns'])
+        self._maps.hold_kept(saved)
         self._stamps = StampOrder(last.stamp_ns)
         self._is_resumed = True
         self.get_logger().warning('resumed with the map of a node that was killed')

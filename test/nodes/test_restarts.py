@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +13,12 @@ import pytest
 from node_chain import CHAIN, NodeChain, seen_again
 from node_messages import grid_arrays
 from ros_graph import fresh_graph, surroundings
+from std_srvs.srv import Trigger
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.core.contracts import POINT_UNKNOWN, LabelledPoints, StereoFrame
 from segfloor_ros.core.files.arrays import MapFile
+from segfloor_ros.core.files.results import read_map_file
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.slam.places.views import NEW_TURN_RAD
@@ -24,7 +27,15 @@ from segfloor_ros.nodes.messages.diagnostics import Level, Status
 from segfloor_ros.nodes.messages.points import labelled_arrays
 from segfloor_ros.nodes.messages.poses import path_arrays, pose_array
 from segfloor_ros.nodes.messages.saved_maps import map_file_of
-from segfloor_ros.nodes.messages.topics import BEHIND, CAMERA, GRID, MAP_PART, SLAM, to_ns
+from segfloor_ros.nodes.messages.topics import (
+    BEHIND,
+    CAMERA,
+    GRID,
+    MAP_PART,
+    PATIENCE_S,
+    SLAM,
+    to_ns,
+)
 
 NEW_VIEW_RAD = 1.1 * NEW_TURN_RAD
 """Turn per frame: every one is a new view, which becomes a keyframe."""
@@ -34,7 +45,7 @@ PLACES = 110
 STEP_M = 0.05
 FRAME_NS = 100_000_000
 RECEIVED = ('map', 'labelled_points', 'odometry', 'pose', 'keyframe/path', MAP_PART)
-REJOIN_S = 60.0
+REJOIN_S, FOUND_S = 60.0, 3.0
 
 
 @pytest.fixture(scope='module')
@@ -198,6 +209,39 @@ def test_keyframes_that_come_while_a_node_is_away_reach_the_map(journey, node) -
         return set(grid.get('stamp_ns', np.zeros(0)).tolist())
 
     chain.graph.until(lambda: mapped() >= set(stamps), 'all keyframes in the map')
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('waits', [False, True])
+def test_nodes_that_are_killed_together_go_on_with_one_map(journey, waits, tmp_path) -> None:
+    """The grid has not the last keyframes of SLAM. SLAM goes on without them, too, unless the grid
+    was stopped for long; a map can be saved at once.
+    """
+    chain, file = journey.chain, tmp_path / 'kept.map'
+    journey.keyframes(1)
+    journey.settle()
+    os.kill(chain.pid(GRID), signal.SIGSTOP)
+    stopped_ns = [journey.step().stamp_ns for _ in range(3)]
+    journey.settle()
+    if waits:
+        time.sleep(PATIENCE_S + 1)
+    for node in CHAIN:
+        chain.kill(node)
+    chain.start(*CHAIN, save_map=file)
+    client = chain.graph.tester.create_client(Trigger, 'stereo_slam/save_map')
+    chain.graph.comes(lambda: False, FOUND_S)  # the killed node seems to offer it, too
+    answer = client.call_async(Trigger.Request())
+    chain.graph.until(answer.done, 'the saved map')
+    saved = answer.result()
+    assert saved.success, saved.message
+    parts = read_map_file(file).parts
+    of_slam = set(parts['slam']['keyframe_stamp_ns'].tolist())
+    of_grid = set(parts['grid']['stamp_ns'].tolist())
+    assert len(of_grid) > 4
+    assert (of_slam >= set(stopped_ns)) == waits
+    assert (of_slam <= of_grid) != waits
+    chain.wake(journey.stand)
+    journey.rejoin()
 
 
 @pytest.mark.slow
