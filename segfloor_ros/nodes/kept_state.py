@@ -60,17 +60,19 @@ class KeptState:
             written.write_text(json.dumps(values))
             written.replace(self._note)
 
-    def save(self, make: Callable[[], MapFile], spent_s: float = 0.0) -> None:
+    def save(self, make: Callable[[], MapFile]) -> None:
         """Keep what `make` returns in place of the last map, where that was not kept only just now;
         it is written beside the work of the node. A full disk is no reason to stop: the older map
-        stays. spent_s: that the map has taken already.
+        stays.
         """
         if self.is_due:
-            start_s = time.monotonic() - spent_s
-            self._writing = threading.Thread(target=self._write, args=(make(), start_s))
+            start_s = time.thread_time()
+            saved = make()
+            spent_s = time.thread_time() - start_s
+            self._writing = threading.Thread(target=self._write, args=(saved, spent_s))
             self._writing.start()
 
-    def _write(self, saved: MapFile, start_s: float) -> None:
+    def _write(self, saved: MapFile, spent_s: float) -> None:
         with contextlib.suppress(OSError):
             self.file.parent.mkdir(mode=0o700, exist_ok=True)
             self._check_private()
@@ -80,8 +82,9 @@ class KeptState:
             # At once: each write to the file waits for Python's lock, which tracking holds.
             written.write_bytes(to_bytes(saved, compress=False))
             written.replace(self.file)
-        now_s = time.monotonic()
-        self._next_save_s = now_s + LEAST_SHARE * (now_s - start_s)
+        # Not the time it waits for others: on a busy machine a restart needs a recent map, too.
+        spent_s += time.thread_time()
+        self._next_save_s = time.monotonic() + LEAST_SHARE * spent_s
 
     def finish(self) -> None:
         """Wait until the map is written."""

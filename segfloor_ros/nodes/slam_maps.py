@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -46,12 +45,6 @@ class SlamMaps:
         self.kept = KeptState(node.get_fully_qualified_name(), self._own.resume_within_s)
         node.outputs.at_clean_up(self.kept.remove)
         self._kept_ns: list[int] = []
-        self._to_keep: MapFile | None = None
-        """SLAM's own part of a map that is kept once the nodes behind have all its keyframes."""
-        self._to_keep_ns = 0
-        self._making_s = self._wait_until_s = 0.0
-        self._silent: set[str] = set()
-        """Nodes behind that were waited for in vain; they have sent nothing since."""
         self._parts: dict[str, MapFile] = {}
         """What the nodes behind know, by name; each with the map that it belongs to."""
         self._asked: dict[str, int] = {}
@@ -91,7 +84,7 @@ class SlamMaps:
 
     def hold_kept(self, saved: MapFile) -> None:
         """Hold what the nodes behind know of the map of a killed node. Its keyframes are not sent
-        again, so that a part which was not waited for has all that it can have.
+        again: a part that lacks the last ones has all that it can have.
         """
         last_ns = saved.header['last_ns'].items()
         self.hold(saved, {name: max(stamp_ns, _last_ns(saved)) for name, stamp_ns in last_ns})
@@ -117,37 +110,11 @@ class SlamMaps:
         slam = self._slam()
         if slam is None or slam.mount is None or not slam.map.keyframes or self._own.localize:
             return
-        slam_ns = slam.map.keyframes[-1].stamp_ns
-        is_new = self._newest_ns(slam_ns) != self._kept_ns
-        if self._to_keep is None and is_new and slam.back_end.idle and self.kept.is_due:
-            begun_s = time.monotonic()
-            self._to_keep_ns = slam_ns
-            self._to_keep = self._slam_part()
-            self._making_s = time.monotonic() - begun_s
-            self._wait_until_s = begun_s + PATIENCE_S
-        self._keep()
-
-    def _newest_ns(self, slam_ns: int) -> list[int]:
-        return [slam_ns, *(part.header['last_ns'] for part in self._parts.values())]
-
-    def _keep(self) -> None:
-        """Keep a map once the nodes behind have its keyframes: when all are killed, nobody sends
-        them again. A node that does not answer for `PATIENCE_S` is not waited for.
-        """
-        saved = self._to_keep
-        if saved is None:
-            return
-        if saved.header['start_ns'] != self._topics.map_start_ns:
-            self._to_keep = None
-            return
-        covering = {name for name, part in self._parts.items() if _covers(part, saved)}
-        missing = self._asked.keys() - covering - self._silent
-        if missing and time.monotonic() < self._wait_until_s:
-            return
-        self._silent |= missing
-        self._to_keep = None
-        self._kept_ns = self._newest_ns(self._to_keep_ns)
-        self.kept.save(lambda: self._with_parts(saved), self._making_s)
+        newest = [slam.map.keyframes[-1].stamp_ns]
+        newest += [part.header['last_ns'] for part in self._parts.values()]
+        if newest != self._kept_ns and slam.back_end.idle and self.kept.is_due:
+            self.kept.save(lambda: self._with_parts(self._slam_part()))
+            self._kept_ns = newest
 
     def _with_parts(self, saved: MapFile) -> MapFile:
         """Add what the nodes behind know of the map, and the latest keyframe in each part."""
@@ -269,7 +236,6 @@ class SlamMaps:
         part = map_file_of(message, MAP_PART)
         name, start_ns = part.header['part'], part.header['start_ns']
         self._asked[name] = part.header['asked']
-        self._silent.discard(name)
         if start_ns is None:
             self._is_to_answer = True
         elif not part.header['frame_id']:
@@ -277,7 +243,6 @@ class SlamMaps:
         else:
             self._parts[name] = part
             self._gather(part)
-            self._keep()
 
     def _gather(self, part: MapFile) -> None:
         """Take a part that a save waits for: of its map, with its last keyframe."""

@@ -26,13 +26,14 @@ from segfloor_ros.nodes.kept_state import KeptState
 from segfloor_ros.nodes.messages.diagnostics import Level, Status
 from segfloor_ros.nodes.messages.points import labelled_arrays
 from segfloor_ros.nodes.messages.poses import path_arrays, pose_array
-from segfloor_ros.nodes.messages.saved_maps import map_file_of
+from segfloor_ros.nodes.messages.saved_maps import map_file_message, map_file_of
 from segfloor_ros.nodes.messages.topics import (
     BEHIND,
     CAMERA,
     GRID,
+    IMAGES,
+    MAP_LOADED,
     MAP_PART,
-    PATIENCE_S,
     SLAM,
     to_ns,
 )
@@ -212,19 +213,14 @@ def test_keyframes_that_come_while_a_node_is_away_reach_the_map(journey, node) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('waits', [False, True])
-def test_nodes_that_are_killed_together_go_on_with_one_map(journey, waits, tmp_path) -> None:
-    """The grid has not the last keyframes of SLAM. SLAM goes on without them, too, unless the grid
-    was stopped for long; a map can be saved at once.
-    """
+def test_a_map_is_saved_after_all_nodes_were_killed_together(journey, tmp_path) -> None:
+    """Nobody sends the grid the last keyframes of SLAM again."""
     chain, file = journey.chain, tmp_path / 'kept.map'
     journey.keyframes(1)
     journey.settle()
     os.kill(chain.pid(GRID), signal.SIGSTOP)
-    stopped_ns = [journey.step().stamp_ns for _ in range(3)]
+    stamps_ns = {journey.step().stamp_ns for _ in range(3)}
     journey.settle()
-    if waits:
-        time.sleep(PATIENCE_S + 1)
     for node in CHAIN:
         chain.kill(node)
     chain.start(*CHAIN, save_map=file)
@@ -232,15 +228,37 @@ def test_nodes_that_are_killed_together_go_on_with_one_map(journey, waits, tmp_p
     chain.graph.comes(lambda: False, FOUND_S)  # the killed node seems to offer it, too
     answer = client.call_async(Trigger.Request())
     chain.graph.until(answer.done, 'the saved map')
-    saved = answer.result()
-    assert saved.success, saved.message
+    assert answer.result().success, answer.result().message
     parts = read_map_file(file).parts
-    of_slam = set(parts['slam']['keyframe_stamp_ns'].tolist())
+    assert stamps_ns <= set(parts['slam']['keyframe_stamp_ns'].tolist())
     of_grid = set(parts['grid']['stamp_ns'].tolist())
-    assert len(of_grid) > 4
-    assert (of_slam >= set(stopped_ns)) == waits
-    assert (of_slam <= of_grid) != waits
+    assert len(of_grid) > 4 and not stamps_ns & of_grid
     chain.wake(journey.stand)
+    journey.rejoin()
+
+
+@pytest.mark.slow
+def test_parts_do_not_wait_behind_the_images_of_a_busy_slam(journey) -> None:
+    """What SLAM keeps meanwhile would lack the keyframes of the parts that wait."""
+    graph, chain = journey.chain.graph, journey.chain
+    asks, loaded = graph.publisher(MAP_PART), graph.collect(MAP_LOADED)
+    graph.connected([asks])
+    journey.settle()
+    frames = [journey.next() for _ in range(IMAGES.depth)]
+    for frame in frames:
+        chain.send(frame)
+    for asked in range(1, len(frames) + 1):
+        header = {'part': 'tester', 'start_ns': None, 'asked': asked}
+        asks.publish(map_file_message(MapFile(header)))
+
+    def answered() -> list[int]:
+        headers = (map_file_of(message, MAP_LOADED).header for message in loaded)
+        return [header['asked'].get('tester') for header in headers]
+
+    graph.until(lambda: len(frames) in answered(), 'the answer')
+    # SLAM answers between two frames: with one question for each there are many answers.
+    assert len(answered()) <= len(frames) / 6
+    chain.answers(frame.stamp_ns for frame in frames)
     journey.rejoin()
 
 

@@ -110,9 +110,9 @@ LATCHED = _reliable(durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED_BY_MANY = _reliable(KEYFRAMES.depth, DurabilityPolicy.TRANSIENT_LOCAL)
 """What listens to the last values of many nodes, e.g. to the fixed frames of tf."""
 
-RECENT = _reliable(20, DurabilityPolicy.TRANSIENT_LOCAL)
-"""What publishers keep of keyframes for a node that is started again: two a second come within
-`PATIENCE_S`.
+RECENT = _reliable(12, DurabilityPolicy.TRANSIENT_LOCAL)
+"""What publishers keep of keyframes for a node that is started again: that takes up to 2 s, what
+SLAM keeps of it is up to 1 s older, and at most four keyframes come in a second.
 """
 
 
