@@ -174,7 +174,7 @@ def page(node: str) -> str:
         _topics(subscribed_by(node, alternatives=True))
         or f'Nothing (at rate 0 or lossless: {", ".join(f"`{name}`" for name in PACED_BY)}).',
         '## Publishes',
-        _topics([*published_by(node, alternatives=True), DIAGNOSTICS]),
+        _topics([*published_by(node, alternatives=True), DIAGNOSTICS], are_published=True),
         STATUS[node] + ' Once a second `connections` tells the subscribers of each topic, and '
         '`health` how the node fares: its `state`, `rate_hz` and `delay_s` of each input, how many '
         'keyframes or frames were `processed`, `failed` or `dropped`, `processing_ms`, `rss_mb`, '
@@ -193,8 +193,16 @@ def page(node: str) -> str:
     return '\n\n'.join(sections) + '\n'
 
 
-def _topics(topics: list[Topic]) -> str:
-    rows = [(f'`{t.name}`', f'`{t.type_name}`', describe(t.profile), ABOUT[t.name]) for t in topics]
+def _topics(topics: list[Topic], are_published: bool = False) -> str:
+    rows = [
+        (
+            f'`{t.name}`',
+            f'`{t.type_name}`',
+            describe(t.offered if are_published else t.profile),
+            ABOUT[t.name],
+        )
+        for t in topics
+    ]
     return _table(('topic', 'type', 'QoS', 'what it holds'), rows) if rows else ''
 
 

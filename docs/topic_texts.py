@@ -65,10 +65,13 @@ ABOUT = {
         'The keyframe, and as time_ref when its map began: another time_ref is another map.'
     ),
     'map_file/loaded': (
-        'What the nodes behind need of a map that was loaded, as the bytes of a map file.'
+        'What stereo_slam keeps of the nodes behind it, as the bytes of a map file: when one of '
+        'them asks for it, and when a map is loaded.'
     ),
-    'map_file/wanted': 'The header of the latest keyframe of a map that is to be saved.',
-    'map_file/part': 'What a node knows of the map at that keyframe, as the bytes of a map file.',
+    'map_file/part': (
+        'What a node knows of the map, as the bytes of a map file; from a node that does not know '
+        'its map, the question for it.'
+    ),
     'keyframe/features': (
         'Features of the keyframe: x y z in map (m, NaN where unknown), u v (px), id (-1: none).'
     ),

@@ -65,7 +65,7 @@ class Graph:
 
     def publisher(self, name: str) -> Any:
         """Return a publisher of a topic."""
-        return self.tester.create_publisher(TOPICS[name].type, name, TOPICS[name].profile)
+        return self.tester.create_publisher(TOPICS[name].type, name, TOPICS[name].offered)
 
     def connected(self, publishers: list[Any]) -> None:
         """Wait until every publisher has a subscriber."""

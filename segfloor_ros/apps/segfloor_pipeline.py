@@ -30,7 +30,7 @@ BEHIND = (FloorSegmentationNode, CloudLabellingNode, OccupancyGridNode)
 class Helper:
     """A forked process with the other nodes. It begins when it is told to; when one of the two
     processes ends, so does the other. When one is killed, the other goes as if it was killed, too:
-    what both keep for their next lives stays.
+    what SLAM keeps for the next life stays.
     """
 
     def __init__(self) -> None:

@@ -93,12 +93,15 @@ def write_tum(path: Path, trajectory: Trajectory, comments: Iterable[str] = ()) 
     path.write_text(''.join(lines))
 
 
-def read_trajectory(path: Path) -> tuple[Array, Array]:
+def read_trajectory(path: Path, may_be_empty: bool = False) -> tuple[Array, Array]:
     """Return times (N,) in seconds and poses (N, 4, 4) of a TUM or KITTI file, whose times may have
     another unit (`digits_of`).
 
-    KITTI poses take their times from times.txt in the same folder. Raises InputError.
+    KITTI poses take their times from times.txt in the same folder. may_be_empty: N may be 0, as of
+    the keyframes of a run that only localised. Raises InputError.
     """
+    if may_be_empty and next(read_lines(path), None) is None:
+        return np.empty(0), np.empty((0, 4, 4))
     table = read_table(path)
     if table.shape[1] == len(TUM_COLUMNS):
         table[:, 0] /= _units_in_a_second(path)

@@ -71,7 +71,9 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
         """Make the topics."""
         self._robot_check = RobotCheck(self, 'floor_segmentation')
         keyframes = KeyframeJoin(self, (MAP_POINTS, FEATURES, POSE, MASK), self._label)
-        self._part = MapPart(self, keyframes, 'cloud', lambda: self._stage.to_arrays())
+        self._part = MapPart(
+            self, keyframes, 'cloud', lambda: self._stage.to_arrays(), self._restore
+        )
         self.inputs.subscribe('odometry', self._keep_alive, is_wanted=self._obstacles_are_wanted)
 
     def reset_stage(self) -> None:
@@ -82,10 +84,9 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
         self._told_ns = self._tracked_ns = 0
         self._listeners = 0
 
-    def restore(self, saved: MapFile) -> None:
+    def _restore(self, saved: MapFile) -> None:
         """Go on with the labels of a map, and publish its obstacles where they are known."""
         self._stage.from_arrays(saved.parts['cloud'])
-        self._part.resume(saved)
         points = saved.parts.get('points')
         if points is not None:
             cloud = SparseCloud(points['point_id'], points['xyz_map'])

@@ -31,10 +31,12 @@ from segfloor_ros.nodes.messages.topics import (
 )
 from segfloor_ros.nodes.settings.floor import FloorSegmentationNodeSettings
 from segfloor_ros.nodes.shared.keyframes import KeyframeJoin
+from segfloor_ros.nodes.shared.map_parts import MapPart
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
 
 POSE = 'keyframe/odometry'
+PICTURES = ('keyframe/floor_overlay', 'keyframe/v_disparity')
 FRAME_SCANS = {'scan': free_scan_message, 'obstacle_scan': obstacle_scan_message}
 
 
@@ -107,9 +109,11 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
             may_process=self._has_mount,
             optional=(MOVING_MASK, SEMANTIC_MASK),
         )
+        self._part = MapPart(self, self._keyframes, 'floor')
 
     def reset_stage(self) -> None:
         """Begin anew."""
+        self._part.reset()
         self._frame_scan.reset()
         self._camera: StereoCamera | None = None
         self._stage: FloorSegmentation | None = None
@@ -152,20 +156,16 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
             self.reporter.diagnose(what, words, lasts_s=float('inf'))
         out, at = self.outputs, (stamp_ns, frame_id)
         out.publish('keyframe/floor_mask', image_message(*at, floor.mask))
-        scan = scan_message(stamp_ns, self._base_frame, floor.scan)
-        out.publish('keyframe/floor_scan', scan)
+        out.publish('keyframe/floor_scan', scan_message(stamp_ns, self._base_frame, floor.scan))
         if out.listeners('keyframe/disparity'):
             out.publish('keyframe/disparity', disparity_message(*at, camera, floor))
-        if out.listeners('keyframe/floor_overlay'):
-            from segfloor_ros.core.floor.pictures import mask_overlay
+        for name in filter(out.listeners, PICTURES):
+            from segfloor_ros.core.floor.pictures import mask_overlay, v_disparity_picture
 
-            picture = mask_overlay(left, floor.mask)
-            out.publish('keyframe/floor_overlay', image_message(*at, picture, 'bgr8'))
-        if out.listeners('keyframe/v_disparity'):
-            from segfloor_ros.core.floor.pictures import v_disparity_picture
-
-            picture = v_disparity_picture(floor)
-            out.publish('keyframe/v_disparity', image_message(*at, picture, 'bgr8'))
+            is_mask = name == PICTURES[0]
+            picture = mask_overlay(left, floor.mask) if is_mask else v_disparity_picture(floor)
+            out.publish(name, image_message(*at, picture, 'bgr8'))
+        self._part.note(stamp_ns, parts[POSE].header.frame_id)
         return {'remarks': REMARKS_APART.join(remarks.values())}
 
     def find_problems(self) -> None:

@@ -37,7 +37,9 @@ class OccupancyGridNode(StageNode[OccupancyGridNodeSettings]):
         self._later: Timer | None = None
         parts = (POINTS, FEATURES, PATH, POSE, SCAN)
         self._keyframes = KeyframeJoin(self, parts, self._update, is_last=True)
-        self._part = MapPart(self, self._keyframes, 'grid', lambda: self._stage.to_arrays())
+        self._part = MapPart(
+            self, self._keyframes, 'grid', lambda: self._stage.to_arrays(), self._restore
+        )
         self.outputs.trigger('save_map', self._save)
 
     def reset_stage(self) -> None:
@@ -46,11 +48,10 @@ class OccupancyGridNode(StageNode[OccupancyGridNodeSettings]):
         self._stage = make_mapper(self.settings)
         self._published_s = -float('inf')
 
-    def restore(self, saved: MapFile) -> None:
+    def _restore(self, saved: MapFile) -> None:
         """Go on with a map, and publish it at once."""
         arrays = saved.parts['grid']
         self._stage.from_arrays(arrays, arrays['stamp_ns'])
-        self._part.resume(saved)
         self._publish()
 
     def on_inputs_closed(self) -> None:

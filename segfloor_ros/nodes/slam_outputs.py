@@ -23,7 +23,7 @@ from segfloor_ros.nodes.messages import points, poses
 from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART, Level
 from segfloor_ros.nodes.messages.images import image_message
-from segfloor_ros.nodes.messages.map_starts import map_start_message
+from segfloor_ros.nodes.messages.saved_maps import map_start_message
 from segfloor_ros.nodes.messages.topics import (
     CORRECTED,
     FRAME_PARTS,
@@ -64,13 +64,11 @@ class SlamTopics:
         self._frame_ns = -math.inf
         self.map_start_ns = 0
         """When the map was begun, by which the nodes behind know one map from another."""
-        self._is_loaded = False
 
-    def reset(self, map_start_ns: int, is_loaded: bool = False) -> None:
+    def reset(self, map_start_ns: int) -> None:
         """Publish about another map from now on; velocities are not known across a reset."""
         # The time of a recording that is played again may be the same twice.
         self.begin_map(map_start_ns + (map_start_ns == self.map_start_ns))
-        self._is_loaded = is_loaded
         self.newest_ns = -1
         """Stamp of the newest pose."""
         self.frames = CameraFrames('', '')
@@ -204,7 +202,7 @@ class SlamTopics:
         covariance = odometry_messages.never_certain(result.covariance_in_map)
         pose = odometry_messages.odometry_message(*at, own.base_frame, T_map_base, covariance)
         out.publish('keyframe/odometry', pose)
-        out.publish(MAP_START, map_start_message(*at, self.map_start_ns, self._is_loaded))
+        out.publish(MAP_START, map_start_message(*at, self.map_start_ns))
 
 
 class SlamResults:
@@ -220,9 +218,9 @@ class SlamResults:
         self._unsent: deque[tuple[FrameResult, StereoSlam, float]] = deque()
         self._send_more = node.inputs.later(self._send_some)
 
-    def reset(self, map_start_ns: int, is_loaded: bool = False) -> None:
+    def reset(self, map_start_ns: int) -> None:
         """Publish about another map from now on, of a camera whose mount is not known."""
-        self.topics.reset(map_start_ns, is_loaded)
+        self.topics.reset(map_start_ns)
         self._unsent.clear()
         self._lost_since_ns: int | None = None
         self._in_map_since_ns: int | None = None

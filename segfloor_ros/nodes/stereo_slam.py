@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.contracts import Mount, StereoFrame
+from segfloor_ros.core.contracts import LastPose, LoadedMap, Mount, StereoFrame
 from segfloor_ros.core.errors import InputError, about
 from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE, StereoSlam
@@ -48,12 +48,12 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         self.outputs.at_clean_up(self._end_stage)
 
     def reset_stage(self) -> None:
-        """Begin with the map of `load_map` or an empty one; the mount of the camera is found again,
-        too.
+        """Begin with the map of a killed node, that of `load_map` or an empty one; the mount of the
+        camera is found again, too.
         """
         saved = self._maps.read()
         self._end_stage()
-        self._results.reset(self.get_clock().now().nanoseconds, is_loaded=saved is not None)
+        self._results.reset(self.get_clock().now().nanoseconds)
         self._transforms.reset()
         self._camera.reset()
         self._sensors.reset()
@@ -62,42 +62,42 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         self._stamps = StampOrder()
         self._is_started = self._is_resumed = False
         self._frame_count = 0
-        if saved is not None:
-            from segfloor_ros.core.plugins.maps.saved_slam import load_slam, saved_camera
-
-            name, own = self.settings.load_map, self.settings
-            camera = saved_camera(saved, name)
-            self.slam = self._make_slam(camera)
-            self._maps.loaded = saved, load_slam(self.slam, camera, saved, name, own.localize)
-            self._keep_axes(saved)
+        kept = self._maps.kept.take()
+        if kept is not None:
+            self._resume(kept)
+        elif saved is not None:
+            self._maps.hold_loaded(saved, self._load(saved, self.settings.load_map))
 
     def reset(self, reason: str) -> None:
         """Drop the map, which is saved first where `save_map` names a file."""
         self._maps.save_before_reset()
+        self._maps.kept.remove()
         super().reset(reason)
 
-    def restore(self, saved: MapFile) -> None:
+    def _resume(self, saved: MapFile) -> None:
         """Go on with the map of a killed node: with its stamps, and where it ended. Raises
         InputError.
         """
-        from segfloor_ros.core.plugins.maps.saved_slam import last_pose_of, load_slam, saved_camera
+        from segfloor_ros.core.plugins.maps.saved_slam import last_pose_of
 
         last = last_pose_of(saved.header.get('note', {}))
-        self._end_stage()
         self._results.reset(saved.header['start_ns'])
-        camera = saved_camera(saved, 'kept map')
-        self.slam = self._make_slam(camera)
-        load_slam(self.slam, camera, saved, 'kept map', last=last)
-        self._keep_axes(saved)
+        self._load(saved, 'kept map', last)
+        self._maps.hold_kept(saved)
         self._stamps = StampOrder(last.stamp_ns)
         self._is_resumed = True
+        self.get_logger().warning('resumed with the map of a node that was killed')
 
-    def _keep_axes(self, saved: MapFile) -> None:
-        """Let poses alone have the axes that they had in a saved map."""
-        if self.slam is not None and self.settings.path_only:
-            from segfloor_ros.core.plugins.maps.saved_slam import base_of
+    def _load(self, saved: MapFile, name: str, last: LastPose | None = None) -> LoadedMap:
+        """Make SLAM that goes on with a map; poses alone have the axes that they had in it."""
+        from segfloor_ros.core.plugins.maps.saved_slam import base_of, load_slam, saved_camera
 
+        own, camera = self.settings, saved_camera(saved, name)
+        self.slam = self._make_slam(camera)
+        loaded = load_slam(self.slam, camera, saved, name, own.localize and last is None, last)
+        if own.path_only:
             self.slam.rig.base = base_of(saved)
+        return loaded
 
     def is_needed_otherwise(self) -> bool:
         """Whether anybody listens to tf."""
@@ -130,7 +130,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             self._work()
 
     def _look_again(self) -> None:
-        self._maps.announce()
+        self._maps.work()
         self._camera.find_images()
         self._look()
 
@@ -213,12 +213,10 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         for sensor, remark in slam.sensors.remarks.items():
             self.reporter.diagnose(sensor, remark)
         self._camera.watch.report_faults(slam.rig_check.faults.values())
-        if self._results.mount is not None and slam.back_end.idle:
-            self._maps.keep(slam)
         if slam.last_pose is not None:
             from segfloor_ros.core.plugins.maps.saved_slam import last_pose_values
 
-            self.kept_state.note(last_pose_values(slam.last_pose))
+            self._maps.kept.note(last_pose_values(slam.last_pose))
 
     def _started(self, pair: Pair) -> StereoSlam:
         """Return the stage, made with the first pair, whose calibration is known."""

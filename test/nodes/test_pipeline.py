@@ -17,8 +17,8 @@ from std_srvs.srv import SetBool, Trigger
 from stereo_drive import lockstep_map, room_drive, write_kitti
 
 from segfloor_ros.apps.map_files import load_map
+from segfloor_ros.nodes.kept_state import KeptState
 from segfloor_ros.nodes.messages.topics import CAMERA, GRID, NODES, SLAM, published_by, to_ns
-from segfloor_ros.nodes.shared.kept_state import KeptState
 
 FRAMES = 14
 
@@ -132,8 +132,8 @@ def test_when_one_process_is_killed_the_other_one_ends(victim, tmp_path) -> None
             (helper,) = helpers_of(process)
             wait_until(lambda: len(os.listdir(f'/proc/{helper}/task')) > 5)  # its middleware runs
             time.sleep(3)  # what was kept before is taken up or dropped
-            kept = KeptState(GRID if victim == 'SLAM' else SLAM, 60.0)
-            kept.note({'of': 'the process that is not killed'})
+            kept = KeptState(SLAM, 60.0)
+            kept.note({'of': 'this life'})
             os.kill(process.pid if victim == 'SLAM' else helper, signal.SIGKILL)
             status = process.wait(30)
             wait_until(lambda: not is_running(helper))

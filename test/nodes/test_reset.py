@@ -19,9 +19,9 @@ from segfloor_ros.nodes.configuration import resolve
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.images import image_message
-from segfloor_ros.nodes.messages.map_starts import map_start_message, map_start_ns
 from segfloor_ros.nodes.messages.points import labelled_arrays
 from segfloor_ros.nodes.messages.poses import transform_array
+from segfloor_ros.nodes.messages.saved_maps import map_start_ns
 from segfloor_ros.nodes.messages.topics import MAP_START, TOPICS, to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 from segfloor_ros.nodes.shared.stamp_order import AGREEING
@@ -197,17 +197,3 @@ def test_a_reset_node_forgets_and_goes_on(make_graph) -> None:
     graph.until(lambda: len(labelled) == 2, 'the second keyframe')
     first, second = (labelled_arrays(message, '').confidence for message in labelled)
     np.testing.assert_array_equal(first, second)
-
-
-def test_a_node_is_reset_when_the_keyframes_are_of_another_map(make_graph) -> None:
-    graph = make_graph()
-    labelled = graph.collect('labelled_points')
-    graph.add(CloudLabellingNode())
-    publishers: dict[str, Any] = {}
-    for count, start_ns in enumerate((7, 7, 8), start=1):
-        start = {MAP_START: map_start_message(count * S, 'map', start_ns)}
-        publish(graph, {**cloud_messages(count * S), **start}, publishers)
-        graph.until(lambda count=count: len(labelled) == count, f'keyframe {count}')
-    first, second, third = (labelled_arrays(message, '').confidence for message in labelled)
-    assert not np.array_equal(first, second)
-    np.testing.assert_array_equal(first, third)

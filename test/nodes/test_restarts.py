@@ -1,6 +1,7 @@
 """Each node killed without warning and started again in the middle of a drive."""
 
 import os
+import signal
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -10,28 +11,40 @@ import pytest
 from node_chain import CHAIN, NodeChain, seen_again
 from node_messages import grid_arrays
 from ros_graph import fresh_graph, surroundings
+from std_srvs.srv import Trigger
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.core.contracts import POINT_UNKNOWN, LabelledPoints, StereoFrame
 from segfloor_ros.core.files.arrays import MapFile
+from segfloor_ros.core.files.results import read_map_file
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.slam.places.views import NEW_TURN_RAD
+from segfloor_ros.nodes.kept_state import KeptState
 from segfloor_ros.nodes.messages.diagnostics import Level, Status
 from segfloor_ros.nodes.messages.points import labelled_arrays
 from segfloor_ros.nodes.messages.poses import path_arrays, pose_array
-from segfloor_ros.nodes.messages.topics import CAMERA, FLOOR, GRID, SLAM, to_ns
-from segfloor_ros.nodes.shared.kept_state import KeptState
+from segfloor_ros.nodes.messages.saved_maps import map_file_message, map_file_of
+from segfloor_ros.nodes.messages.topics import (
+    BEHIND,
+    CAMERA,
+    GRID,
+    IMAGES,
+    MAP_LOADED,
+    MAP_PART,
+    SLAM,
+    to_ns,
+)
 
 NEW_VIEW_RAD = 1.1 * NEW_TURN_RAD
 """Turn per frame: every one is a new view, which becomes a keyframe."""
 
-PLACES = 80
+PLACES = 110
 """More than are driven past: a place that is seen again makes no keyframe."""
 STEP_M = 0.05
 FRAME_NS = 100_000_000
-RECEIVED = ('map', 'labelled_points', 'odometry', 'pose', 'keyframe/path')
-REJOIN_S = 60.0
+RECEIVED = ('map', 'labelled_points', 'odometry', 'pose', 'keyframe/path', MAP_PART)
+REJOIN_S, FOUND_S = 60.0, 3.0
 
 
 @pytest.fixture(scope='module')
@@ -174,7 +187,77 @@ def test_a_node_that_is_killed_goes_on_where_it_was(journey, node) -> None:
     rows = np.searchsorted(ids, both)
     assert (cloud_after.label[rows] != POINT_UNKNOWN).mean() > 0.95
     assert 'Traceback' not in chain.log(node)
-    assert ('resumed with the map' in chain.log(node)) == (node != FLOOR)
+    assert 'resumed with the map' in chain.log(node)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('node', BEHIND)
+def test_keyframes_that_come_while_a_node_is_away_reach_the_map(journey, node) -> None:
+    chain = journey.chain
+    journey.keyframes(1)
+    chain.kill(node)
+    stamps: list[int] = []
+    while len(stamps) < 3:
+        answer = journey.step()
+        stamps += [answer.stamp_ns] if answer.values['keyframe'] == '1' else []
+    chain.start(node)
+
+    def mapped() -> set[int]:
+        parts = (map_file_of(message, MAP_PART) for message in reversed(journey.received(MAP_PART)))
+        grid = next((part.parts['grid'] for part in parts if 'grid' in part.parts), {})
+        return set(grid.get('stamp_ns', np.zeros(0)).tolist())
+
+    chain.graph.until(lambda: mapped() >= set(stamps), 'all keyframes in the map')
+
+
+@pytest.mark.slow
+def test_a_map_is_saved_after_all_nodes_were_killed_together(journey, tmp_path) -> None:
+    """Nobody sends the grid the last keyframes of SLAM again."""
+    chain, file = journey.chain, tmp_path / 'kept.map'
+    journey.keyframes(1)
+    journey.settle()
+    os.kill(chain.pid(GRID), signal.SIGSTOP)
+    stamps_ns = {journey.step().stamp_ns for _ in range(3)}
+    journey.settle()
+    for node in CHAIN:
+        chain.kill(node)
+    chain.start(*CHAIN, save_map=file)
+    client = chain.graph.tester.create_client(Trigger, 'stereo_slam/save_map')
+    chain.graph.comes(lambda: False, FOUND_S)  # the killed node seems to offer it, too
+    answer = client.call_async(Trigger.Request())
+    chain.graph.until(answer.done, 'the saved map')
+    assert answer.result().success, answer.result().message
+    parts = read_map_file(file).parts
+    assert stamps_ns <= set(parts['slam']['keyframe_stamp_ns'].tolist())
+    of_grid = set(parts['grid']['stamp_ns'].tolist())
+    assert len(of_grid) > 4 and not stamps_ns & of_grid
+    chain.wake(journey.stand)
+    journey.rejoin()
+
+
+@pytest.mark.slow
+def test_parts_do_not_wait_behind_the_images_of_a_busy_slam(journey) -> None:
+    """What SLAM keeps meanwhile would lack the keyframes of the parts that wait."""
+    graph, chain = journey.chain.graph, journey.chain
+    asks, loaded = graph.publisher(MAP_PART), graph.collect(MAP_LOADED)
+    graph.connected([asks])
+    journey.settle()
+    frames = [journey.next() for _ in range(IMAGES.depth)]
+    for frame in frames:
+        chain.send(frame)
+    for asked in range(1, len(frames) + 1):
+        header = {'part': 'tester', 'start_ns': None, 'asked': asked}
+        asks.publish(map_file_message(MapFile(header)))
+
+    def answered() -> list[int]:
+        headers = (map_file_of(message, MAP_LOADED).header for message in loaded)
+        return [header['asked'].get('tester') for header in headers]
+
+    graph.until(lambda: len(frames) in answered(), 'the answer')
+    # SLAM answers between two frames: with one question for each there are many answers.
+    assert len(answered()) <= len(frames) / 6
+    chain.answers(frame.stamp_ns for frame in frames)
+    journey.rejoin()
 
 
 @pytest.mark.slow
@@ -300,23 +383,15 @@ def test_what_is_kept_is_found_once_by_the_same_user_and_only_for_a_while(own_fo
     assert not file.exists()
 
 
-def test_what_came_too_soon_after_the_last_is_kept_when_it_is_time(own_folder) -> None:
-    """A robot that stands makes no keyframe that would keep the one before."""
+def test_what_is_kept_is_kept_again_when_it_is_time(own_folder) -> None:
     kept = KeptState('/robot/stereo_slam', 30.0)
     keep(kept)
-    keep(kept, 2)
+    keep(kept, 2)  # too soon after the last one
     deadline_s = time.monotonic() + 20
     while not kept.is_due and time.monotonic() < deadline_s:
         time.sleep(0.01)
-    kept.catch_up()
-    kept.finish()
-    assert kept_value(kept) == 2
-    kept.catch_up()
-    assert kept_value(kept) is None, 'once'
     keep(kept, 3)
-    kept.remove()
-    kept.catch_up()
-    assert kept_value(kept) is None, 'what is removed does not come back'
+    assert kept_value(kept) == 3
 
 
 def test_what_a_killed_node_leaves_does_not_reach_the_next_graph(monkeypatch) -> None:

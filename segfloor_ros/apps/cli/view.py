@@ -418,7 +418,7 @@ def read_results(folder: Path) -> Results:
         folder,
         read_summary(folder / 'summary.json'),
         read_trajectory(folder / 'trajectory.txt'),
-        read_trajectory(folder / 'keyframes.txt'),
+        read_trajectory(folder / 'keyframes.txt', may_be_empty=True),
         read_ply(folder / 'labelled_cloud.ply'),
     )
 

@@ -41,6 +41,8 @@ from segfloor_ros.core.floor.plane.plane import LOOKS, SURE, SWAY
 NO_TEXT = re.compile('[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]')
 """In names of files: what controls a terminal, and bytes that are not UTF-8."""
 
+LOCALIZED = 'keyframes, all of the loaded map: the run only localised'
+
 STYLE = Path(__file__).with_name('report.css')
 
 
@@ -121,7 +123,7 @@ def _facts(data: ReportData) -> str:
         (f'{summary["frames"]}', 'frames'),
         (f'{tracked:.1f} %', 'of them tracked'),
         (f'{_length_m(data):.1f} m', 'of path'),
-        (f'{summary["keyframes"]}', 'keyframes'),
+        (f'{summary["keyframes"]}', 'keyframes' if len(data.keyframes) else LOCALIZED),
         (f'{summary["loops"]}', 'loops closed'),
         (f'{summary["map_updates"]}', 'map updates'),
         (f'{summary["frames_per_s"]:.1f}', 'frames per second'),

@@ -278,7 +278,7 @@ def read_run(folder: Path, truth: Path | None = None) -> ReportData:
     parameters = resolve(settings)
     source = open_source(parameters.stereo_camera)
     times_s, trajectory = read_trajectory(folder / 'trajectory.txt')
-    keyframe_s, keyframes = read_trajectory(folder / 'keyframes.txt')
+    keyframe_s, keyframes = read_trajectory(folder / 'keyframes.txt', may_be_empty=True)
     closed = np.searchsorted(keyframe_s, summary.get('loop_times_s', []))
     return ReportData(
         folder=folder,

@@ -4,9 +4,24 @@ from __future__ import annotations
 
 import array
 
+from sensor_msgs.msg import TimeReference
 from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
 
 from segfloor_ros.core.files.arrays import MapFile
+from segfloor_ros.nodes.messages.making import make_header, to_ns, to_time
+
+LEAST_SHARE = 20
+"""Times that keeping a map took pass before it is kept again."""
+
+
+def map_start_message(stamp_ns: int, frame_id: str, start_ns: int) -> TimeReference:
+    """Return that the keyframe of a stamp belongs to the map that was begun at `start_ns`."""
+    return TimeReference(header=make_header(stamp_ns, frame_id), time_ref=to_time(start_ns))
+
+
+def map_start_ns(message: TimeReference) -> int:
+    """Return when the keyframe's map was begun."""
+    return to_ns(message.time_ref)
 
 
 def map_file_message(saved: MapFile) -> UInt8MultiArray:

@@ -50,7 +50,8 @@ _IN_FOLDER = ('DEFAULT_FASTRTPS_PROFILES.xml', 'DEFAULT_FASTDDS_PROFILES.xml')
 
 CAMERA, SLAM = 'stereo_camera', 'stereo_slam'
 FLOOR, CLOUD, GRID = 'floor_segmentation', 'cloud_labelling', 'occupancy_grid'
-NODES = (CAMERA, SLAM, FLOOR, CLOUD, GRID)
+BEHIND = (FLOOR, CLOUD, GRID)
+NODES = (CAMERA, SLAM, *BEHIND)
 """The nodes in the order of the data flow."""
 
 ROBOT = 'simulated_robot'
@@ -64,7 +65,7 @@ OTHERS = ''
 
 MOVING_MASK, SEMANTIC_MASK = 'keyframe/moving_mask', 'keyframe/semantic_mask'
 MAP_START = 'keyframe/map_start'
-MAP_LOADED, MAP_WANTED, MAP_PART = 'map_file/loaded', 'map_file/wanted', 'map_file/part'
+MAP_LOADED, MAP_PART = 'map_file/loaded', 'map_file/part'
 FRAME_DONE, KEYFRAME_DONE = 'frame_done', 'keyframe/done'
 CORRECTED = '/corrected'
 """Ends the names of the topics on which poses come again that were provisional: the stamps of
@@ -109,6 +110,11 @@ LATCHED = _reliable(durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED_BY_MANY = _reliable(KEYFRAMES.depth, DurabilityPolicy.TRANSIENT_LOCAL)
 """What listens to the last values of many nodes, e.g. to the fixed frames of tf."""
 
+RECENT = _reliable(12, DurabilityPolicy.TRANSIENT_LOCAL)
+"""What publishers keep of keyframes for a node that is started again: that takes up to 2 s, what
+SLAM keeps of it is up to 1 s older, and at most four keyframes come in a second.
+"""
+
 
 def best_effort(profile: QoSProfile) -> QoSProfile:
     """Return a profile for drivers that publish best effort; messages may be lost."""
@@ -142,6 +148,14 @@ class Topic:
     is_optional: bool = False
     on_demand_by: tuple[str, ...] = ()
     also_by: tuple[str, ...] = ()
+
+    @property
+    def offered(self) -> QoSProfile:
+        """The profile of its publishers; `profile` is that of its subscribers."""
+        if self.profile is LATCHED_BY_MANY:
+            return LATCHED
+        is_joined = self.profile is KEYFRAMES and not {*BEHIND}.isdisjoint(self.subscribers)
+        return RECENT if is_joined else self.profile
 
     @property
     def type_name(self) -> str:
@@ -225,11 +239,12 @@ _ALL = [
     Topic(SEMANTIC_MASK, Image, KEYFRAMES, MASKS, (FLOOR,), is_optional=True),
     Topic(FRAME_DONE, Header, KEYFRAMES, SLAM),
     Topic('camera_mount', TransformStamped, LATCHED, SLAM, (FLOOR, MASKS)),
-    Topic('keyframe/odometry', Odometry, KEYFRAMES, SLAM, (FLOOR, CLOUD, GRID)),
-    Topic(MAP_START, TimeReference, KEYFRAMES, SLAM, (FLOOR, CLOUD, GRID), is_optional=True),
-    Topic(MAP_LOADED, UInt8MultiArray, LATCHED, SLAM, (CLOUD, GRID), is_optional=True),
-    Topic(MAP_WANTED, Header, KEYFRAMES, SLAM, (CLOUD, GRID), is_optional=True),
-    Topic(MAP_PART, UInt8MultiArray, KEYFRAMES, CLOUD, (SLAM,), is_optional=True, also_by=(GRID,)),
+    Topic('keyframe/odometry', Odometry, KEYFRAMES, SLAM, BEHIND),
+    Topic(MAP_START, TimeReference, KEYFRAMES, SLAM, BEHIND, is_optional=True),
+    Topic(MAP_LOADED, UInt8MultiArray, LATCHED, SLAM, BEHIND, is_optional=True),
+    Topic(
+        MAP_PART, UInt8MultiArray, LATCHED_BY_MANY, FLOOR, (SLAM,), is_optional=True, also_by=BEHIND
+    ),
     *_rectified_pair(KEYFRAME_PARTS, KEYFRAMES, of_right=(FLOOR,), of_left=(FLOOR, MASKS)),
     *_rectified_pair(FRAME_PARTS, FRAMES, is_optional=True, on_demand_by=(FLOOR,)),
     Topic('keyframe/features', PointCloud2, KEYFRAMES, SLAM, (CLOUD, GRID, MASKS)),

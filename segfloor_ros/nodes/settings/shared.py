@@ -17,12 +17,6 @@ class NodeSettings(StageSettings):
     autostart: bool = setting(
         True, 'Configure and activate at the start; off: wait for a lifecycle manager.'
     )
-    resume_within_s: float = setting(
-        30.0,
-        'A node that was killed resumes with what it knew if it is started again within this time; '
-        '0: it starts with an empty map.',
-        within=(0.0, 3600.0),
-    )
 
     @classmethod
     def stage_name(cls) -> str:

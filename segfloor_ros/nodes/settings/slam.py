@@ -44,6 +44,12 @@ class StereoSlamNodeSettings(StereoSlamSettings, NodeSettings):
         'Poses alone, without floor and map; where the mount of the camera is not known, the base '
         'is taken to be where the camera is.',
     )
+    resume_within_s: float = setting(
+        30.0,
+        'The map goes on where a node that was killed is started again within this time; 0: with '
+        'an empty map. The nodes behind take what they knew from this one.',
+        within=(0.0, 3600.0),
+    )
     save_map: str = setting('', 'File that ~/save_map writes the whole map to.', live=True)
     background: bool = setting(
         True,

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from rclpy.qos import DurabilityPolicy
 from sensor_msgs.msg import TimeReference
 
-from segfloor_ros.nodes.messages.diagnostics import Level
-from segfloor_ros.nodes.messages.map_starts import is_of_loaded_map, map_start_ns
-from segfloor_ros.nodes.messages.topics import KEYFRAME_DONE, KEYFRAMES, MAP_START, make_header
+from segfloor_ros.nodes.messages.diagnostics import HEALTH_PERIOD_S, Level
+from segfloor_ros.nodes.messages.saved_maps import map_start_ns
+from segfloor_ros.nodes.messages.topics import (
+    KEYFRAME_DONE,
+    KEYFRAMES,
+    LATCHED_BY_MANY,
+    MAP_START,
+    make_header,
+)
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 
 Process = Callable[[int, dict[str, Any]], Mapping[str, Any]]
@@ -20,8 +28,9 @@ Process = Callable[[int, dict[str, Any]], Mapping[str, Any]]
 
 
 class KeyframeJoin:
-    """Joins the parts of a keyframe and has the node process them. Where SLAM tells which map a
-    keyframe belongs to, the node is reset before the first one of another map.
+    """Joins the parts of a keyframe and has the node process them, at the start of the node those
+    that publishers keep. Where SLAM tells which map a keyframe belongs to, the node is reset before
+    the first one of another map.
 
     may_process: keyframes are kept while it says no, until `process_waiting`. is_last: the
     keyframe goes no further when the node has processed it. optional: parts that are waited for
@@ -43,16 +52,21 @@ class KeyframeJoin:
         self._is_last = is_last
         self._waiting: deque[tuple[int, dict[str, Any]]] = deque(maxlen=KEYFRAMES.depth)
         self._left_ns: int | None = None
+        self._profile = LATCHED_BY_MANY
         self.map_start_ns: int | None = None
         """When the map was begun; None where nobody has said."""
-        self.is_loaded = False
-        """Whether the map goes on from a file."""
+        self.known_ns = -math.inf
+        """Keyframes up to this stamp are in the map that the node was started with."""
 
         def is_published(topic: str) -> bool:
             return bool(node.inputs.subscriptions[topic].get_publisher_count())
 
         published = {topic: partial(is_published, topic) for topic in (MAP_START, *optional)}
-        node.inputs.join(parts, self._take, optional=published)
+        self._parts = (*parts, *published)
+        node.inputs.join(
+            parts, self._take, choose_profile=lambda: self._profile, optional=published
+        )
+        node.inputs.every(HEALTH_PERIOD_S, self._adapt_to_offers)
 
     @property
     def waiting_count(self) -> int:
@@ -64,12 +78,13 @@ class KeyframeJoin:
         if start_ns != self.map_start_ns:
             self._waiting.clear()
             self._left_ns, self.map_start_ns = self.map_start_ns, start_ns
+            self.known_ns = -math.inf
 
     def process_waiting(self) -> None:
         """Process what is kept, as far as it may be."""
         while self._waiting and self.may_process():
             stamp_ns, parts = self._waiting.popleft()
-            is_well = self._work(stamp_ns, parts)
+            is_well = stamp_ns <= self.known_ns or self._work(stamp_ns, parts)
             if self._is_last or not is_well:
                 self._node.outputs.publish(KEYFRAME_DONE, make_header(stamp_ns, ''))
 
@@ -85,7 +100,16 @@ class KeyframeJoin:
         self._node.reporter.report_processed(stamp_ns, Level.OK, 'running', milliseconds, **values)
         return True
 
+    def _adapt_to_offers(self) -> None:
+        """Take what others publish that keep nothing."""
+        look = self._node.get_publishers_info_by_topic
+        offered = {info.qos_profile.durability for name in self._parts for info in look(name)}
+        if self._profile is not KEYFRAMES and DurabilityPolicy.VOLATILE in offered:
+            self._profile = KEYFRAMES
+            self._node.inputs.reopen()
+
     def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
+        self._profile = KEYFRAMES  # what comes while the inputs are closed is missed
         if MAP_START in parts and not self._follow(parts[MAP_START]):
             self._node.outputs.publish(KEYFRAME_DONE, make_header(stamp_ns, ''))
             return
@@ -100,5 +124,4 @@ class KeyframeJoin:
                 return False
             self._node.reset('stereo_slam has begun a new map')
         self.leave_for(start_ns)
-        self.is_loaded = is_of_loaded_map(message)
         return True

@@ -112,9 +112,9 @@ class Reporter:
         """
         delay_s = 1e-9 * (self._node.get_clock().now().nanoseconds - stamp_ns)
         waited_s = 1e-9 * (time.time_ns() - int(info.get('received_timestamp') or time.time_ns()))
-        self.health.received(topic.name, delay_s, waited_s)
-        # Of a latched topic only the last message counts.
-        if topic.profile.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+        is_latched = topic.profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        self.health.received(topic.name, delay_s, 0.0 if is_latched else waited_s)
+        if is_latched:  # only the last message counts
             return
         losses = self._losses.setdefault(topic.name, LossCounter())
         lost = losses.note(info.get('publication_sequence_number'))

@@ -18,12 +18,10 @@ from rclpy.publisher import Publisher
 from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.core.errors import SegfloorError
-from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.nodes.messages.diagnostics import HEALTH_PERIOD_S
 from segfloor_ros.nodes.messages.topics import TOPICS, Topic, published_by
 from segfloor_ros.nodes.settings.shared import NodeSettings
 from segfloor_ros.nodes.shared.inputs import CHECK_S, Inputs
-from segfloor_ros.nodes.shared.kept_state import KeptState
 from segfloor_ros.nodes.shared.reporter import Connections, Reporter, one_line
 from segfloor_ros.nodes.shared.running import NodeParameters
 
@@ -47,7 +45,7 @@ class Outputs:
         topic = TOPICS[name]
         # What does not connect is reported in words and on /diagnostics.
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
-        made = self._node.create_publisher(topic.type, name, topic.profile, event_callbacks=quiet)
+        made = self._node.create_publisher(topic.type, name, topic.offered, event_callbacks=quiet)
         self.publishers[name] = made
         self.at_clean_up(lambda: self._node.destroy_publisher(made))
         return made
@@ -190,15 +188,10 @@ class States(ManagedEntity):
         try:
             node.outputs.service(SetBool, '~/pause', self._answer_pause)
             node.outputs.service(Trigger, '~/reset', self._answer_reset)
-            node.outputs.at_clean_up(node.kept_state.remove)
             for topic in node.output_topics():
                 node.outputs.publisher(topic.name)
             node.set_up()
             node.reset_stage()
-            kept = node.kept_state.take()
-            if kept is not None:
-                node.restore(kept)
-                node.get_logger().warning('resumed with the map of a node that was killed')
         except Exception:
             self.clean_up()
             raise
@@ -254,7 +247,6 @@ class StageNode(LifecycleNode, ABC, Generic[Settings]):
         self.reporter = Reporter(self)
         self.inputs = Inputs(self, self.reporter)
         self.outputs = Outputs(self, self.reporter)
-        self.kept_state = KeptState(self.get_fully_qualified_name(), self.settings.resume_within_s)
         self.states = States(self)
         publishers, subscriptions = self.outputs.publishers, self.inputs.subscriptions
         self._connections = Connections(self, self.reporter, publishers, subscriptions)
@@ -278,11 +270,6 @@ class StageNode(LifecycleNode, ABC, Generic[Settings]):
     @abstractmethod
     def reset_stage(self) -> None:
         """Begin with an empty map, first of all after `set_up`. The topics stay."""
-
-    def restore(self, saved: MapFile) -> None:
-        """Go on with a map, first of all after `reset_stage`: what a killed node has left in
-        `kept_state`, or what SLAM has loaded.
-        """
 
     def on_inputs_opened(self) -> None:
         """Prepare for messages, at first and after a pause."""
@@ -315,7 +302,6 @@ class StageNode(LifecycleNode, ABC, Generic[Settings]):
 
     def reset(self, reason: str) -> None:
         """Drop the map and begin with an empty one, with one line in the log."""
-        self.kept_state.remove()
         self.reset_stage()
         self.get_logger().warning(f'reset: {reason}')
 
@@ -325,11 +311,7 @@ class StageNode(LifecycleNode, ABC, Generic[Settings]):
         super().destroy_node()
 
     def _check(self) -> None:
-        """Report connections and health, look whether the node is needed, and keep the map."""
-        try:
-            self.kept_state.catch_up()
-        except Exception as error:
-            self.reporter.log_fault('kept map', error)
+        """Report connections and health, and look whether the node is needed."""
         connections, now_s = self._connections, time.monotonic()
         always = not self.works_on_demand or self.states.label != 'active'
         self.states.need(connections.are_needed(always or self.is_needed_otherwise()))

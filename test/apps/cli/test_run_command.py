@@ -294,7 +294,12 @@ def test_a_saved_map_is_localized_in(recording, result, tmp_path):
     assert segfloor('map', 'export', saved, tmp_path / 'on_disk.yaml').returncode == 0
     assert (tmp_path / 'on_disk.pgm').read_bytes() == (first / 'map.pgm').read_bytes()
     second = tmp_path / 'second'
-    done = segfloor('run', recording, '--out', second, '--load-map', saved, '--localize')
+    words = '--load-map', saved, '--localize', '--report'
+    done = segfloor('run', recording, '--out', second, *words)
+    assert done.returncode == 0, done.stderr
+    page = (second / 'report.html').read_text()
+    assert 'keyframes, all of the loaded map: the run only localised' in page
+    done = segfloor('view', second, '--out', tmp_path / 'second.rrd')
     assert done.returncode == 0, done.stderr
     assert (second / 'map.pgm').read_bytes() == (first / 'map.pgm').read_bytes()
     before, after = (np.loadtxt(out / 'trajectory.txt') for out in (first, second))

@@ -39,7 +39,7 @@ from segfloor_ros.nodes.messages import (
 from segfloor_ros.nodes.messages import images as arrays
 from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import Level, Status, status_message, statuses
-from segfloor_ros.nodes.messages.map_starts import map_start_message, map_start_ns
+from segfloor_ros.nodes.messages.saved_maps import map_start_message, map_start_ns
 from segfloor_ros.nodes.messages.topics import to_ns, to_time
 
 STAMP_NS = 1_403_715_273_262_142_976

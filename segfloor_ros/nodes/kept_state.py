@@ -1,6 +1,4 @@
-"""The map of a node: its keyframes, joined from their messages; its part of a saved map; and what
-is kept of it where it outlives a crash of the node.
-"""
+"""The map that outlives a crash of the node `stereo_slam`."""
 
 from __future__ import annotations
 
@@ -13,18 +11,13 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.arrays import MapFile
-
-if TYPE_CHECKING:
-    pass
-
+from segfloor_ros.nodes.messages.saved_maps import LEAST_SHARE
 
 IN_MEMORY = '/dev/shm'
-LEAST_SHARE = 20
-"""Times the duration of a save that passes before the next one: keeping costs little time."""
 
 
 class KeptState:
@@ -46,7 +39,6 @@ class KeptState:
         self._resume_within_s = resume_within_s
         self._next_save_s = -float('inf')
         self._writing: threading.Thread | None = None
-        self._waiting: Callable[[], MapFile] | None = None
 
     @property
     def is_due(self) -> bool:
@@ -69,33 +61,30 @@ class KeptState:
             written.replace(self._note)
 
     def save(self, make: Callable[[], MapFile]) -> None:
-        """Keep what `make` returns in place of the last map, later where that was kept only just
-        now (`catch_up`); it is written beside the work of the node. A full disk is no reason to
-        stop: the older map stays.
+        """Keep what `make` returns in place of the last map, where that was not kept only just now;
+        it is written beside the work of the node. A full disk is no reason to stop: the older map
+        stays.
         """
-        self._waiting = make
-        self.catch_up()
-
-    def catch_up(self) -> None:
-        """Keep what is still to be kept, once it is time."""
-        make = self._waiting
-        if make is not None and self.is_due:
-            self._waiting, start_s = None, time.monotonic()
-            self._writing = threading.Thread(target=self._write, args=(make(), start_s))
+        if self.is_due:
+            start_s = time.thread_time()
+            saved = make()
+            spent_s = time.thread_time() - start_s
+            self._writing = threading.Thread(target=self._write, args=(saved, spent_s))
             self._writing.start()
 
-    def _write(self, saved: MapFile, start_s: float) -> None:
+    def _write(self, saved: MapFile, spent_s: float) -> None:
         with contextlib.suppress(OSError):
             self.file.parent.mkdir(mode=0o700, exist_ok=True)
             self._check_private()
-            from segfloor_ros.core.files.results import write_to
+            from segfloor_ros.core.files.results import to_bytes
 
             written = self.file.with_suffix('.part')
-            with written.open('wb') as file:
-                write_to(file, saved, compress=False)
+            # At once: each write to the file waits for Python's lock, which tracking holds.
+            written.write_bytes(to_bytes(saved, compress=False))
             written.replace(self.file)
-        now_s = time.monotonic()
-        self._next_save_s = now_s + LEAST_SHARE * (now_s - start_s)
+        # Not the time it waits for others: on a busy machine a restart needs a recent map, too.
+        spent_s += time.thread_time()
+        self._next_save_s = time.monotonic() + LEAST_SHARE * spent_s
 
     def finish(self) -> None:
         """Wait until the map is written."""
@@ -126,7 +115,6 @@ class KeptState:
 
     def remove(self) -> None:
         """Leave nothing to be taken up; in a folder that is not private, nothing is touched."""
-        self._waiting = None
         self.finish()
         with contextlib.suppress(OSError):
             self._check_private()
