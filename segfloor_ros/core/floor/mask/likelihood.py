@@ -55,7 +55,7 @@ _SURE = math.log(0.95 / 0.05)
 _CARRY_PX = 20.0
 """So far a likelihood is carried where no edge is, in pixels of these pictures."""
 
-_LOCAL, _ROUNDS = (31, 15), 4
+_LOCAL, _ROUNDS = (31, 15), 8
 """Columns and rows of the window in which the floor around a pixel is measured, and how often."""
 _NOTHING, _DENSE = 0.02, 0.5
 """A share of a window that tells nothing, and one that ground reaches where both cameras see it:
