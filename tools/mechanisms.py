@@ -191,7 +191,12 @@ FLOOR: dict[str, Mechanism] = {
         {'core.floor.mask.pixel_evidence._foreign': lambda left, *_: _nowhere(left)}
     ),
     'likelihood of floor': Mechanism(
-        {'core.floor.segmentation.Likelihood.weighed': lambda self, mask, seen: mask}
+        {
+            'core.floor.segmentation.Likelihood.weighed': lambda self, mask, seen: (
+                mask,
+                _nowhere(mask),
+            )
+        }
     ),
     'floor beside the profile': Mechanism(
         {

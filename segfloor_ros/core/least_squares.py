@@ -8,7 +8,7 @@ and Welsch, 1977).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Protocol, TypeVar
 
 S = TypeVar('S', bound='State')
@@ -36,29 +36,28 @@ class State(Protocol):
         """
 
 
-def improve(state: S, steps: int, tolerance: float, damping: float = 1e-4) -> Iterator[S]:
-    """Yield the state of the least cost found so far, after each half of a step: the linearisation
-    and the solution (Madsen, Nielsen and Tingleff, Methods for Non-Linear Least Squares Problems,
-    2004, section 3.2). It ends when the cost falls by less than a share of it, the tolerance.
+def minimise(
+    state: S,
+    steps: int,
+    tolerance: float,
+    damping: float = 1e-4,
+    is_wanted: Callable[[], bool] = lambda: True,
+) -> S:
+    """Return the state of the least cost found within some steps (Madsen, Nielsen and Tingleff,
+    Methods for Non-Linear Least Squares Problems, 2004, section 3.2). It ends when the cost falls
+    by less than a share of it, the tolerance, or when the result is no longer wanted.
     """
     solve = None
     for _ in range(steps):
-        if solve is None:
-            solve = state.linearised()
-            yield state
+        if not is_wanted():
+            break
+        solve = solve or state.linearised()
         trial, factor = solve(damping)
-        decrease, enough = state.cost - trial.cost, tolerance * state.cost + SMALLEST
-        if decrease >= 0:
-            state, solve, damping = trial, None, damping * factor
-        else:  # also where it is no number
+        decrease = state.cost - trial.cost
+        if not decrease >= 0:  # nor where it is no number
             damping *= GROW
-        yield state
-        if 0 <= decrease < enough:
-            return
-
-
-def minimise(state: S, steps: int, tolerance: float, damping: float = 1e-4) -> S:
-    """Return the state of the least cost that `improve` finds."""
-    for better in improve(state, steps, tolerance, damping):
-        state = better
+            continue
+        if decrease < tolerance * state.cost + SMALLEST:
+            return trial
+        state, solve, damping = trial, None, damping * factor
     return state

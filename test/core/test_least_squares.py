@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from segfloor_ros.core.gauss_newton import gauss_newton
 from segfloor_ros.core.geometry import invert, transform_points
-from segfloor_ros.core.least_squares import SHRINK, improve, minimise
+from segfloor_ros.core.least_squares import SHRINK, minimise
 from segfloor_ros.core.slam.mapping.bundle_adjustment import adjust
 from segfloor_ros.core.slam.mapping.normal_equations import Links
 from segfloor_ros.core.slam.rig import residuals
@@ -57,25 +57,9 @@ def test_no_step_raises_the_cost() -> None:
     assert costs == sorted(costs, reverse=True)
 
 
-def test_between_two_states_there_is_half_a_step_at_most() -> None:
-    done: list[str] = []
-
-    class Noted(Rosenbrock):
-        def linearised(self) -> Callable[[float], tuple[Rosenbrock, float]]:
-            done.append('linearised')
-            solve = super().linearised()
-
-            def stepped(damping: float) -> tuple[Rosenbrock, float]:
-                done.append('solved')
-                found, factor = solve(damping)
-                return Noted(found.x, found.dampings), factor
-
-            return stepped
-
-    start = Noted(np.array([-1.2, 1.0]))
-    counts = [len(done) for _ in improve(start, 5, 0.0)]
-    assert counts == list(range(1, len(counts) + 1))
-    assert done.count('solved') == 5
+def test_what_is_no_longer_wanted_ends() -> None:
+    start = Rosenbrock(np.array([-1.2, 1.0]))
+    assert minimise(start, 10, 0.0, is_wanted=lambda: False) is start
 
 
 def test_a_step_to_where_the_cost_is_no_number_is_not_taken() -> None:

@@ -118,11 +118,11 @@ def test_images_offered_best_effort_are_taken_as_that_by_themselves(
 
 def test_a_listener_that_asks_for_more_than_is_offered_is_named(make_graph) -> None:
     graph = make_graph()
-    topic = TOPICS['labelled_points']
+    topic = TOPICS['floor_points']
     profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     graph.tester.create_subscription(topic.type, topic.name, lambda _: None, profile)
     graph.add(CloudLabellingNode())
-    words = ('/labelled_points: nothing reaches /tester', 'transient local', 'volatile')
+    words = ('/floor_points: nothing reaches /tester', 'transient local', 'volatile')
     assert says(graph, 'cloud_labelling', *words).level is Level.ERROR
 
 

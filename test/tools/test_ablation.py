@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
+from floor_scenes import SMALL_CAMERA, Scene, floor_patch, wall
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
 from typer.testing import CliRunner
 
 from segfloor_ros.core.camera.recording import RecordedSensor
-from segfloor_ros.core.contracts import StereoFrame, WheelPose
+from segfloor_ros.core.contracts import FLOOR, StereoFrame, WheelPose
+from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.settings import StereoSlamSettings
@@ -65,3 +68,14 @@ def test_the_error_of_a_path_without_a_mechanism_is_printed(tmp_path) -> None:
     for _, _, error_m, tracked, keyframes, points in rows:
         assert 0 < float(error_m) < 0.02
         assert int(tracked) == 8 and int(keyframes) >= 2 and int(points) > 100
+
+
+@pytest.mark.parametrize('name', sorted(FLOOR_MECHANISMS))
+def test_floor_is_segmented_without_each_mechanism(name) -> None:
+    room = Scene([floor_patch(), wall(2.0)], SMALL_CAMERA)
+    left, right, _, _ = room.render()
+    with FLOOR_MECHANISMS[name].left_out():
+        stage = FloorSegmentation(SMALL_CAMERA, FloorSegmentationSettings())
+        mask = stage.process(left, right, room.mount).mask
+    assert mask.shape == left.shape
+    assert np.mean(mask == FLOOR) > 0.2

@@ -267,6 +267,13 @@ def test_benchmark_prints_json_in_place_of_tables():
         assert workload['memory_mb']['peak'] >= workload['memory_mb']['start'] > 0
 
 
+@pytest.mark.slow
+def test_benchmark_prints_tables():
+    output = run('--sizes', '3,5', '--frames', '3')
+    for words in ('3 keyframes', '5 keyframes', 'floor_segmentation', 'reference', 'MB/update'):
+        assert words in output
+
+
 @pytest.mark.parametrize('sizes', ['10,many', '', '10,0'])
 def test_bad_sizes(sizes):
     with pytest.raises(SettingsError, match=r'--sizes .*expected numbers'):

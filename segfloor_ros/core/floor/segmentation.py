@@ -302,7 +302,7 @@ def _seen(frame: FrameEvidence, mask: NDArray[np.uint8], step_m: float) -> Seen:
         left_only=frame.view.columns[half[1]] < compared.floor_px,
         grey=grey.astype(np.float32),
         noise_grey=pair.noise_grey if pair.measured is None else 0.0,
-        step=step_m / frame.view.mount.height_m,
+        step=step_m / max(frame.view.mount.height_m - step_m, step_m),
         mask=mask[half],
     )
 

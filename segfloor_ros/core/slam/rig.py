@@ -250,10 +250,7 @@ def with_moment(p: Array, vectors: Array) -> Array:
     """
     x, y, z = p
     a, b, c = vectors
-    both = np.empty((6, *vectors.shape[1:]))
-    both[:3] = vectors
-    both[3], both[4], both[5] = y * c - z * b, z * a - x * c, x * b - y * a
-    return both
+    return np.stack([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
 
 
 def squared_norms(residual: Array, information: Array) -> Array:

@@ -110,9 +110,6 @@ class StereoSlam:
 
     def process(self, frame: StereoFrame) -> list[FrameResult]:
         """Track one frame and return the results that are ready, oldest first."""
-        if self.back_end.is_due:
-            with self._times.measure('mapping'):
-                self.back_end.go_on()
         with self._times.measure('tracking'):
             self._take_in_changes()
             fault = self.front_end.fault(frame)

@@ -248,6 +248,14 @@ def test_impossible_poses_are_refused() -> None:
         poses.path_arrays(message)
 
 
+def test_a_path_of_impossible_poses_is_refused() -> None:
+    path = KeyframePath(np.array([5, 7, 9]), se3_exp(RNG.normal(size=(3, 6))))
+    message = poses.PathMessages('map').next(STAMP_NS, path)
+    message.poses[2].pose.position.x = float('inf')
+    with pytest.raises(InputError):
+        poses.path_arrays(over_the_wire(message))
+
+
 def test_poses_that_have_not_moved_are_sent_again_and_others_anew() -> None:
     first = KeyframePath(np.array([5, 7, 9]), se3_exp(RNG.normal(size=(3, 6))))
     moved = KeyframePath(np.array([5, 7, 9, 11]), se3_exp(RNG.normal(size=(4, 6))))

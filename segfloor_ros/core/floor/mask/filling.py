@@ -138,8 +138,8 @@ def drop_islands(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the mask without patches of floor smaller than a share of the largest."""
     small = (mask[::STEP_PX, ::STEP_PX] == FLOOR).astype(np.uint8)
     _, label, stats, _ = cv2.connectedComponentsWithStats(small, connectivity=8)
-    area = stats[:, cv2.CC_STAT_AREA]
-    is_small = area < _ISLAND_SHARE * area[1:].max(initial=0)
+    area = stats[1:, cv2.CC_STAT_AREA]
+    is_small = np.append(False, area < _ISLAND_SHARE * area.max(initial=0))
     return without_floor(mask, enlarged(is_small[label], mask))
 
 

@@ -84,8 +84,8 @@ class Seen:
     a floor's disparity, per row of the image. texture: as many times of what is surely no noise.
     lower: bool, what lies deeper than a robot may drop. left_only: bool, what the right camera does
     not see if it is floor. grey: brightness, smoothed. noise_grey: of the images, 0 of depth that
-    is measured. step: what a robot climbs, over how high the camera is. mask: uint8, what is floor
-    so far, and what is not.
+    is measured. step: what a robot climbs, over how much higher the camera is. mask: uint8, what is
+    floor so far, and what is not.
     """
 
     floor_px: Picture
@@ -138,8 +138,8 @@ def _spread(values: Picture, where: NDArray[np.bool_], bounds: tuple[float, floa
 def _height(
     seen: Seen, weight: Picture, known: Picture
 ) -> tuple[Picture, Picture, NDArray[np.bool_]]:
-    """Return how high blocks of pixels are above the floor around them, in sigmas, and which share
-    around each is on it, less that which is off it.
+    """Return how high blocks of pixels are above the floor around them, in sigmas; which share
+    around each is on it, less that which is off it; and what is no higher than a robot climbs.
 
     The error is that of this very floor: how blocks differ from the floor around them. The profile
     may lie above the ground beside a stone: at first what is lower counts as floor, but nothing
@@ -162,7 +162,7 @@ def _height(
         sigma = float(_spread(gap, even, _UNEVEN_PX))
         lowest = -SIGMAS * sigma
     height = np.clip(gap / np.float32(sigma), -_MOST_SIGMAS, _MOST_SIGMAS)
-    is_low = gap < np.float32(seen.step) * (seen.floor_px + floor)
+    is_low = gap < np.minimum(np.float32(seen.step) * (seen.floor_px + floor), most_px / 2)
     on_off = np.where(np.abs(height) < SIGMAS, weight, -weight)
     mostly_on = mean_of_known(on_off, known, _WIDE)[0]
     return height * np.minimum(share / np.float32(LEAST_KNOWN), 1), mostly_on, is_low
@@ -193,8 +193,8 @@ def _look(seen: Seen) -> Picture:
     what stands on it; 0 where no floor is known.
     """
     is_floor = seen.mask == FLOOR
-    bins = sigmas_off_floor(seen.grey, is_floor, STEP_PX) * _BINS
-    bins = np.clip(bins + (_END * _BINS + 0.5), 0, 2 * _END * _BINS).astype(np.intp)
+    sigmas = sigmas_off_floor(seen.grey, is_floor, STEP_PX)
+    bins = np.clip(sigmas * _BINS + (_END * _BINS + 0.5), 0, 2 * _END * _BINS).astype(np.intp)
     number = 2 * _END * _BINS + 1
     prior, found = np.full(number, 1 / number), []
     for some, other in ((is_floor, _FOREIGN), (seen.mask == NOT_FLOOR, _UNSEEN)):
@@ -204,7 +204,7 @@ def _look(seen: Seen) -> Picture:
         found.append(share * (counts + number * prior) + other * prior)
         prior = (prior + found[0]) / 2
     look: Picture = np.log(found[0] / found[1]).astype(np.float32)[bins]
-    return look * np.float32(is_floor.any())
+    return look * np.float32(sigmas.any())
 
 
 def _with_border(part: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -269,7 +269,7 @@ def carry(log_ratio: Picture, weight: Picture, seen: Seen) -> Picture:
     bounded = np.clip(np.where(stands, -_MOST_NATS, log_ratio), -_MOST_NATS, _MOST_NATS)
     level = np.log(cv2.blur(seen.grey, (5, 5)) + 8)
     step = np.abs(np.diff(level, axis=1, append=level[:, -1:]))
-    own = np.median(step[weight * bounded > LEAST_KNOWN].tolist() or 1.0)
+    own = float(np.median(step[weight * bounded > LEAST_KNOWN].tolist() or 1.0))
     kept = np.exp(-1 / _CARRY_PX - np.maximum(step / (2 * max(own, 1e-3)) - 1, 0))
     parts = np.stack([cv2.blur(part, (5, 15)) for part in (bounded * weight, weight)])
     for column in reversed(range(parts.shape[2] - 1)):

@@ -10,7 +10,6 @@ second are looked for in the first by what they observed, one after the other.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -249,8 +248,7 @@ def _close_loops(merged: SparseMap, places: PlaceRecognition, begin: int) -> Non
             closing = plan_closing(merged, matches)
             apply_closing(merged, closing, optimise(closing.graph))
     copied = copy_map(merged, merged.rig.offset.estimate, None)
-    for adjusted in deque(solve_global(merged.rig.camera, copied), maxlen=1):
-        apply_global(merged, adjusted)
+    apply_global(merged, solve_global(merged.rig.camera, copied, lambda: True))
 
 
 def as_seen_by(camera: StereoCamera, offset_px: float, own: StereoCamera, arrays: Arrays) -> Arrays:

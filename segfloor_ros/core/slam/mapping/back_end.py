@@ -6,7 +6,7 @@ Runs what takes long, an adjustment or the closing of a loop, beside tracking or
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -42,18 +42,12 @@ GROWN = 1.25
 it was last: that costs a long drive no more than a few adjustments of all it has mapped."""
 
 
-OBSERVATIONS = 150_000
-"""An adjustment of the whole map that does not run on a thread is done in parts: a frame goes
-through so many observations of it, about as many as the adjustment of a neighbourhood does."""
-
-
 class BackEnd:
     """Adjusts the neighbourhood of every keyframe, closes loops, and adjusts the whole map after a
     loop that moves it far or once it has grown.
 
-    background: on threads beside tracking; else at once, and of the whole map over the next frames,
-    so that the outcome does not depend on timing. Tracking never waits for an adjustment of the
-    whole map.
+    background: on threads beside tracking; else at once, so that the outcome does not depend on
+    timing. Tracking never waits for an adjustment of the whole map.
     """
 
     def __init__(self, sparse_map: SparseMap, front_end: FrontEnd, background: bool) -> None:
@@ -140,15 +134,6 @@ class BackEnd:
         if change():
             self._front_end.follow_map(before, self._map.keyframes[-1].T_camera_world)
 
-    @property
-    def is_due(self) -> bool:
-        """Whether a frame is to go on with an adjustment of the whole map."""
-        return self._global.holds_one and not self._background
-
-    def go_on(self) -> None:
-        """Go on with an adjustment of the whole map; `collect` brings it into the map."""
-        self._global.go_on(OBSERVATIONS)
-
     def collect(self, wait: bool) -> None:
         """Bring what is solved into the map; with `wait` a running adjustment of a neighbourhood is
         waited for.
@@ -211,22 +196,22 @@ class BackEnd:
             self._adjusted_keyframes = len(copied.records)
             apply_global(self._map, result)
 
-        self._global.submit_parts(solve_global(self._rig.camera, copied), apply)
+        self._global.submit(
+            partial(solve_global, self._rig.camera, copied, self._global.is_wanted()), apply
+        )
 
 
 class AdjustmentRunner:
     """Holds at most one adjustment.
 
-    Without `background` it is solved when it is submitted, or part by part when `go_on` is called,
-    so that the outcome does not depend on timing.
+    Without `background` it is solved when it is submitted, so that the outcome does not depend on
+    timing.
     """
 
     def __init__(self, background: bool) -> None:
         self._worker = ThreadPoolExecutor(1, 'adjustment') if background else None
         self._apply: Callable[[Any], None] | None = None
         self._result: Future[Any] = Future()
-        self._parts: Iterator[GlobalResult] = iter(())
-        self._found: GlobalResult | None = None
         self._dropped = 0
 
     @property
@@ -238,6 +223,11 @@ class AdjustmentRunner:
     def holds_one(self) -> bool:
         """Whether there is an adjustment that was not collected yet."""
         return self._apply is not None
+
+    def is_wanted(self) -> Callable[[], bool]:
+        """Return whether the next adjustment is still wanted, to be asked while it runs."""
+        number = self._dropped
+        return lambda: self._dropped == number
 
     def reset(self) -> None:
         """Drop an adjustment; one that is running is asked to end."""
@@ -254,29 +244,6 @@ class AdjustmentRunner:
         else:
             self._result = Future()
             self._result.set_result(solve())
-
-    def submit_parts(self, parts: Iterator[GlobalResult], apply: Callable[[Any], None]) -> None:
-        """Begin an adjustment that is done in parts, each of which yields the result so far."""
-        self._apply, self._parts, self._found = apply, parts, None
-        worker = self._worker
-        self._result = worker.submit(self._last, parts, self._dropped) if worker else Future()
-
-    def _last(self, parts: Iterator[GlobalResult], number: int) -> GlobalResult | None:
-        """Return the last result, or that so far once it is no longer wanted."""
-        found = None
-        for found in parts:  # noqa: B007
-            if self._dropped != number:
-                break
-        return found
-
-    def go_on(self, observations: int) -> None:
-        """Go through at least so many observations of an adjustment that is done in parts."""
-        for found in self._parts:
-            self._found = found
-            observations -= len(found.planned.point)
-            if observations <= 0:
-                return
-        self._result.set_result(self._found)
 
     def collect(self, wait: bool) -> bool:
         """Apply a finished adjustment; with `wait` a running one is waited for. Returns whether

@@ -10,10 +10,8 @@ the keyframes it hangs on (Mur-Artal and Tardos, ORB-SLAM2, IEEE T-RO 2017, sect
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import Up
 from segfloor_ros.core.geometry import Array, invert, make_transform, transform_points
-from segfloor_ros.core.least_squares import SMALLEST, improve
+from segfloor_ros.core.least_squares import SMALLEST, minimise
 from segfloor_ros.core.slam.mapping.normal_equations import (
     Factors,
     Linearisation,
@@ -88,19 +86,16 @@ class BundleResult:
     offset: OffsetEstimate
 
 
-def adjust(camera: StereoCamera, problem: BundleProblem, iterations: int = STEPS) -> BundleResult:
+def adjust(
+    camera: StereoCamera,
+    problem: BundleProblem,
+    iterations: int = STEPS,
+    is_wanted: Callable[[], bool] = lambda: True,
+) -> BundleResult:
     """Minimise the Huber cost over free poses and points; damping by the gain ratio (Madsen et
     al., Methods for Non-Linear Least Squares Problems, 2004, algorithm 3.16). A point whose step
-    leads through a camera that sees it waits: one that is far away would spoil the step of all.
-    """
-    return deque(adjust_in_parts(camera, problem, iterations), maxlen=1)[-1]
-
-
-def adjust_in_parts(
-    camera: StereoCamera, problem: BundleProblem, iterations: int = STEPS
-) -> Iterator[BundleResult]:
-    """Yield the best result so far, of which the last is that of `adjust`: after each part of it, a
-    linearisation or a solution.
+    leads through a camera that sees it waits: one that is far away would spoil the step of all. It
+    ends early when the result is no longer wanted.
     """
     order = np.argsort(problem.keyframe, kind='stable')
     in_order = replace(
@@ -110,12 +105,12 @@ def adjust_in_parts(
         observations=problem.observations.take(order),
     )
     start = _State.at(camera, in_order, problem.offset)
-    for state in chain([start], improve(start, iterations, CONVERGED)):
-        adjusted = state.problem
-        inliers = np.empty(len(order), bool)
-        inliers[order] = state.front & (state.chi2 <= adjusted.observations.chi2_limit)
-        poses, points = adjusted.T_camera_world, adjusted.points_world
-        yield BundleResult(poses, points, inliers, start.cost, state.cost, adjusted.offset)
+    end = minimise(start, iterations, CONVERGED, is_wanted=is_wanted)
+    adjusted = end.problem
+    inliers = np.empty(len(order), bool)
+    inliers[order] = end.front & (end.chi2 <= adjusted.observations.chi2_limit)
+    poses, points = adjusted.T_camera_world, adjusted.points_world
+    return BundleResult(poses, points, inliers, start.cost, end.cost, adjusted.offset)
 
 
 @dataclass(frozen=True)
@@ -250,11 +245,12 @@ def copy_map(sparse_map: SparseMap, offset: OffsetEstimate, up_world: Up | None)
     )
 
 
-def solve_global(camera: StereoCamera, copied: MapCopy) -> Iterator[GlobalResult]:
-    """Yield the best result so far of an adjustment of the copy, after each part of it; safe on
-    another thread. Nothing for a map of one view. What was seen says nothing of where the map as a
-    whole is: it stays where its first ten keyframes that take part came into it, on average,
-    weighted by what they show.
+def solve_global(
+    camera: StereoCamera, copied: MapCopy, is_wanted: Callable[[], bool]
+) -> GlobalResult | None:
+    """Adjust the copy; safe on another thread. It ends early when it is no longer wanted. None for
+    a map of one view. What was seen says nothing of where the map as a whole is: it stays where its
+    first ten keyframes that take part came into it, on average, weighted by what they show.
     """
     keyframe, point, row = _known_best(copied)
     count = np.bincount(keyframe, minlength=len(copied.records))
@@ -269,7 +265,7 @@ def solve_global(camera: StereoCamera, copied: MapCopy) -> Iterator[GlobalResult
     ids = np.unique(point)
     free = np.setdiff1d(np.flatnonzero(enough), held)
     if len(ids) == 0 or len(free) == 0:
-        return
+        return None
     chosen = np.append(free, held)
     slot = np.full(len(enough), -1)
     slot[chosen] = np.arange(len(chosen))
@@ -283,16 +279,16 @@ def solve_global(camera: StereoCamera, copied: MapCopy) -> Iterator[GlobalResult
         OffsetEstimate(copied.offset.value_px, NO_OFFSET.information),
         factors_of(copied.records, slot, copied.up_world) + loop_factors(copied.loops, slot),
     )
+    adjusted = adjust(camera, problem, is_wanted=is_wanted)
     T_before = np.stack([copied.first_poses[k] for k in early])
     shown = count[early].astype(np.float64)
-    for adjusted in adjust_in_parts(camera, problem):
-        M = _brought_back(adjusted.T_camera_world[slot[early]], T_before, shown, copied.up_world)
-        adjusted = replace(
-            adjusted,
-            T_camera_world=adjusted.T_camera_world @ invert(M),
-            points_world=transform_points(M, adjusted.points_world),
-        )
-        yield GlobalResult(problem, adjusted, chosen, ids, copied.stable_ids[ids])
+    M = _brought_back(adjusted.T_camera_world[slot[early]], T_before, shown, copied.up_world)
+    adjusted = replace(
+        adjusted,
+        T_camera_world=adjusted.T_camera_world @ invert(M),
+        points_world=transform_points(M, adjusted.points_world),
+    )
+    return GlobalResult(problem, adjusted, chosen, ids, copied.stable_ids[ids])
 
 
 def _brought_back(T_after: Array, T_before: Array, weights: Array, up_world: Up | None) -> Array:

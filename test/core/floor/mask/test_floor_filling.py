@@ -24,6 +24,13 @@ def test_patches_much_smaller_than_the_floor_are_dropped():
     np.testing.assert_array_equal(dropped[others], mask[others])
 
 
+def test_no_floor_and_floor_with_a_hole_stay_as_they_are():
+    for value in (NO_EVIDENCE, FLOOR):
+        mask = np.full((40, 40), value, np.uint8)
+        mask[20, 20] = NO_EVIDENCE
+        np.testing.assert_array_equal(drop_islands(mask), mask)
+
+
 @pytest.mark.parametrize('floor_kind', FLOORS)
 def test_a_blank_board_of_the_shade_of_the_floor_is_not_filled(floor_kind):
     """Floor is seen left and right of it, and nothing tells the two apart but the texture."""

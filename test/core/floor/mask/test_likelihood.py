@@ -203,6 +203,11 @@ def test_what_a_robot_climbs_is_no_floor_but_it_drives_there() -> None:
         assert np.all(mask[61:69, 96:104] == NO_EVIDENCE)
         assert np.all(climbed[62:68, 97:103] == climbs)
         assert not climbed[:, :80].any()
+    # However much a robot climbs, something much higher is in its way.
+    stone_px[STONE] += 20
+    high = dataclasses.replace(seen, disparity_px=stone_px, step=0.8)
+    assert not Likelihood().weighed(seen.mask, high)[1][62:68, 97:103].any()
+    stone_px[STONE] -= 20
     # Upright and as dark as what stands, it is not.
     mask = seen.mask.copy()
     mask[10:20, 20:60] = NOT_FLOOR

@@ -1,5 +1,7 @@
 """Loops: found, verified and closed in a room whose map was bent on purpose."""
 
+from __future__ import annotations
+
 import threading
 
 import numpy as np
@@ -19,7 +21,6 @@ from segfloor_ros.core.slam.places.loops import PlaceMatcher, is_no_drift
 from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import LoopEdge, Match, SparseMap
-from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 from segfloor_ros.core.twists import se3_exp
 
@@ -74,7 +75,6 @@ def test_a_drift_is_found_and_taken_away(closed):
     assert errors[-1] < 0.03
 
 
-@pytest.mark.slow
 def test_a_loop_that_contradicts_the_map_is_not_noted_as_closed(monkeypatch):
     monkeypatch.setattr(back_end, 'apply_closing', lambda *_: False)
     slam, _ = drive(np.array([0.25, 0.0, 0.1, 0.0, 0.03, 0.0]))
@@ -82,29 +82,6 @@ def test_a_loop_that_contradicts_the_map_is_not_noted_as_closed(monkeypatch):
     assert 'contradicts the map' in verdicts
     assert 'closed' not in verdicts
     assert slam.back_end.loop_count == 0
-
-
-def test_each_frame_does_one_part_of_an_adjustment_of_the_whole_map(monkeypatch):
-    parts, of_frames, solve, process = [], [], back_end.solve_global, StereoSlam.process
-
-    def noted(*arguments):
-        for found in solve(*arguments):
-            parts.append(found)
-            yield found
-
-    def counted(slam, frame):
-        before = len(parts)
-        results = process(slam, frame)
-        of_frames.append(len(parts) - before)
-        return results
-
-    monkeypatch.setattr(back_end, 'OBSERVATIONS', 1)
-    monkeypatch.setattr(back_end, 'solve_global', noted)
-    monkeypatch.setattr(StereoSlam, 'process', counted)
-    slam, errors = drive(np.array([0.25, 0.0, 0.1, 0.0, 0.03, 0.0]))
-    assert max(of_frames) == 1 and sum(of_frames) >= 5
-    assert not slam.back_end.is_due
-    assert errors[-1] < 0.03
 
 
 def test_both_ends_become_one_map(closed):
@@ -201,40 +178,32 @@ def test_the_whole_map_is_adjusted_again_once_it_has_grown_or_a_loop_moves_it_fa
 def test_an_adjustment_of_the_whole_map_goes_on_beside_loops_that_move_it_little(
     closed, monkeypatch, off_m, goes_on
 ):
-    begun, end, parts = threading.Event(), threading.Event(), []
+    begun, end, wanted = threading.Event(), threading.Event(), []
 
-    def solve(_camera, _copied):
-        for part in range(3):
-            begun.set()
-            end.wait(30)
-            parts.append(part)
-            yield None
+    def solve(_camera, _copied, is_wanted):
+        wanted.append(is_wanted)
+        begun.set()
+        end.wait(30)
 
     monkeypatch.setattr(back_end, 'solve_global', solve)
     mapping, close = closing_loops(closed, monkeypatch, background=True)
     try:
         close(0.03)
         assert begun.wait(30)
-        first = mapping._global._result
         close(off_m)
-        end.set()
-        first.result(30)
-        assert (len(parts) == 3) is goes_on
+        assert wanted[0]() is goes_on
     finally:
         end.set()
         mapping.close()
 
 
 def test_an_adjustment_goes_on_beside_a_loop_that_is_not_closed(closed, monkeypatch):
-    end, parts = threading.Event(), []
-
-    def solve(_camera, _copied):
-        for part in range(3):
-            end.wait(30)
-            parts.append(part)
-            yield None
-
-    monkeypatch.setattr(back_end, 'solve_global', solve)
+    end, wanted = threading.Event(), []
+    monkeypatch.setattr(
+        back_end,
+        'solve_global',
+        lambda _camera, _copied, is_wanted: wanted.append(is_wanted) or (end.wait(30) and None),
+    )
     mapping, close = closing_loops(closed, monkeypatch, background=True)
     try:
         close(0.03)
@@ -243,29 +212,10 @@ def test_an_adjustment_goes_on_beside_a_loop_that_is_not_closed(closed, monkeypa
         assert mapping._global.holds_one
         end.set()
         mapping._global.collect(wait=True)
-        assert len(parts) == 3
+        assert [is_wanted() for is_wanted in wanted] == [True]
     finally:
         end.set()
         mapping.close()
-
-
-def test_without_a_thread_an_adjustment_is_done_over_the_next_frames(closed, monkeypatch):
-    """Its outcome is the same as at once, for nothing else moves the map here."""
-    poses = {}
-    for amount in (10**9, 1):
-        monkeypatch.setattr(back_end, 'OBSERVATIONS', amount)
-        mapping, close = closing_loops(closed, monkeypatch, background=False)
-        keyframes = mapping._map.keyframes
-        before, frames = np.stack([k.T_camera_world for k in keyframes]), 0
-        close(0.03, go_on=False)
-        while mapping.is_due:
-            mapping.go_on()
-            mapping.collect(wait=False)
-            frames += 1
-        assert (frames == 1) is (amount > 1)
-        poses[amount] = np.stack([k.T_camera_world for k in keyframes])
-        assert np.abs(poses[amount] - before).max() > 1e-4
-    np.testing.assert_array_equal(poses[1], poses[10**9])
 
 
 def closing_loops(closed, monkeypatch, background):
@@ -276,16 +226,13 @@ def closing_loops(closed, monkeypatch, background):
     mapping = back_end.BackEnd(sparse_map, front_end, background)
     last = sparse_map.keyframes[-1]
 
-    def close(off_m, go_on=True):
+    def close(off_m):
         sparse_map.loops.clear()
         pose = se3_exp(np.array([off_m, 0.0, 0.0, 0.0, 0.0, 0.0])) @ last.T_camera_world
         match = Match(last.index, 0, pose, none, none, none)
         monkeypatch.setattr(mapping.loops, 'detect', lambda *_: [match])
         assert mapping._close_loop(last, None)
         mapping.collect(wait=True)
-        if go_on and mapping.is_due:
-            mapping._global.go_on(10**9)
-            mapping.collect(wait=True)
 
     return mapping, close
 
