@@ -222,8 +222,8 @@ class FloorSegmentation:
         self, frame: FrameEvidence, mask: NDArray[np.uint8], looks_odd: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
         """Return the mask with floor where this pair of images alone cannot tell: where it looks
-        like floor. The more floor is known the more goes on, so this is done twice. Nor does it
-        contradict a network that was right so far.
+        like floor. What is filled first lets more be filled, so this is done twice. Where a network
+        was right so far, what it calls floor is floor, too, if the images do not deny it.
         """
         view, pair, consistent = frame.view, frame.pair, frame.compared.consistent
         for _ in range(2):
