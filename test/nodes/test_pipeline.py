@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -102,45 +102,45 @@ def wait_until(is_so: Callable[[], bool]) -> None:
         time.sleep(0.1)
 
 
-@pytest.mark.slow
-def test_a_process_that_is_stopped_and_goes_on_ends_nothing(tmp_path) -> None:
-    said = tmp_path / 'log'
+@contextlib.contextmanager
+def started(said: Path) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+    """Start the program, and wait for SLAM and for the helper; its words go to a file. Gives the
+    process and the number of the helper.
+    """
     with surroundings(), said.open('w') as log:
         process = subprocess.Popen(PIPELINE, stdout=log, stderr=log)
         try:
             wait_until(lambda: f'[{SLAM}]' in said.read_text())
             (helper,) = helpers_of(process)
-            for number in (signal.SIGSTOP, signal.SIGCONT):
-                os.kill(helper, number)
-                time.sleep(0.3)
-            assert is_running(process.pid) and is_running(helper)
-            process.send_signal(signal.SIGINT)
-            assert process.wait(30) == 0
+            yield process, helper
         finally:
             process.kill()
             process.wait()
+
+
+@pytest.mark.slow
+def test_a_process_that_is_stopped_and_goes_on_ends_nothing(tmp_path) -> None:
+    with started(tmp_path / 'log') as (process, helper):
+        for number in (signal.SIGSTOP, signal.SIGCONT):
+            os.kill(helper, number)
+            time.sleep(0.3)
+        assert is_running(process.pid) and is_running(helper)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('victim', ['SLAM', 'the others'])
 def test_when_one_process_is_killed_the_other_one_ends(victim, tmp_path) -> None:
-    said = tmp_path / 'log'
-    with surroundings(), said.open('w') as log:
-        process = subprocess.Popen(PIPELINE, stdout=log, stderr=log)
-        try:
-            wait_until(lambda: f'[{SLAM}]' in said.read_text())
-            (helper,) = helpers_of(process)
-            wait_until(lambda: len(os.listdir(f'/proc/{helper}/task')) > 5)  # its middleware runs
-            time.sleep(3)  # what was kept before is taken up or dropped
-            kept = KeptState(SLAM, 60.0)
-            kept.note({'of': 'this life'})
-            os.kill(process.pid if victim == 'SLAM' else helper, signal.SIGKILL)
-            status = process.wait(30)
-            wait_until(lambda: not is_running(helper))
-            assert kept.file.with_suffix('.json').exists()
-        finally:
-            process.kill()
-            process.wait()
+    with started(tmp_path / 'log') as (process, helper):
+        wait_until(lambda: len(os.listdir(f'/proc/{helper}/task')) > 5)  # its middleware runs
+        time.sleep(3)  # what was kept before is taken up or dropped
+        kept = KeptState(SLAM, 60.0)
+        kept.note({'of': 'this life'})
+        os.kill(process.pid if victim == 'SLAM' else helper, signal.SIGKILL)
+        status = process.wait(30)
+        wait_until(lambda: not is_running(helper))
+        assert kept.file.with_suffix('.json').exists()
     assert status == (-signal.SIGKILL if victim == 'SLAM' else 128 + signal.SIGKILL)
 
 
