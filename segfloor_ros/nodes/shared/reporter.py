@@ -153,9 +153,9 @@ class Reporter:
         """Warn about sets that were given up, naming the topics of the missing parts; those of
         which only the latest counts are nothing.
         """
-        is_passing = all(TOPICS[name].profile is FRAMES for name in joiner.parts)
+        kind = TOPICS[joiner.parts[0]]
         for dropped in joiner.take_dropped():
-            if is_passing:
+            if kind.profile is FRAMES:
                 continue
             names = ', '.join(dropped.missing)
             crowded = ''.join(
@@ -166,9 +166,12 @@ class Reporter:
             text = f'no message on {names} with stamp {dropped.stamp_ns}; dropped{crowded}'
             self.health.count('dropped')
             # Others may still be starting; a second publisher is wrong from the first moment.
-            if crowded or time.monotonic() - self._opened_s >= PATIENCE_S:
+            is_late = bool(crowded) or time.monotonic() - self._opened_s >= PATIENCE_S
+            if is_late:
                 self.diagnose(f'parts {names}{crowded}', text, lasts_s=PATIENCE_S)
-            self.report(dropped.stamp_ns, Level.ERROR, text)
+            # Of the oldest that publishers keep for a node that starts, parts are gone.
+            level = Level.ERROR if is_late or kind.offered is kind.profile else Level.WARN
+            self.report(dropped.stamp_ns, level, text)
 
     def diagnose(
         self,
