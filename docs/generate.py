@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import yaml
 from topic_texts import ABOUT
 
 from segfloor_ros.core.settings import SettingSpec
@@ -27,6 +28,8 @@ from segfloor_ros.nodes.messages.topics import (
 )
 
 PAGES = Path(__file__).parent / 'nodes'
+BASIC = yaml.safe_load((Path(__file__).parents[1] / 'params' / 'basic.yaml').read_text())
+"""The parameters that most robots need, by section; all others are advanced."""
 
 PURPOSE = {
     CAMERA: """\
@@ -184,9 +187,18 @@ def page(node: str) -> str:
     sections += [MANAGED]
     if node in (SLAM, FLOOR, CLOUD):
         sections += [ON_DEMAND]
-    sections += ['## Parameters', _parameters(stage)]
-    if own:
-        sections += ['Only the node has these; `segfloor run` passes over them:', _parameters(own)]
+    if node in STAGE_SETTINGS:
+        names_of = [BASIC.get(section, {}) for section in (f'/**/{node}', '/**')]
+        basic = [name for values in names_of for name in values.get('ros__parameters', {})]
+        specs = {spec.name: spec for spec in (*stage, *own)}
+        first = [specs.pop(name) for name in basic if name in specs]
+        sections += ['## Basic parameters', _parameters(first)]
+        sections += ['## Advanced parameters', _parameters(list(specs.values()))]
+    else:
+        sections += ['## Parameters', _parameters([*stage, *own])]
+    if own and node in STAGE_SETTINGS:
+        of_node = ', '.join(f'`{spec.name}`' for spec in own)
+        sections.append(f'`segfloor run` ignores what only the node has: {of_node}.')
     sections.append(
         'Live parameters can be set while the node runs; the others are read at its start.'
     )

@@ -44,11 +44,6 @@ class StereoSlamSettings(StageSettings):
         40.0, 'A motion faster than this is implausible and ends tracking.', within=(0.1, 100.0)
     )
     detect_moving: bool = setting(True, 'Leave out what moves, as far as the stereo pairs show it.')
-    mask_dilation_px: int = setting(
-        5,
-        'A mask of moving things (`dynamic_mask`, `--masks`) is widened by this much.',
-        within=(0, 100),
-    )
     keyframe_max_frames: int = setting(
         30, 'A new keyframe is due after this many frames (condition A1).', within=(1, 1000)
     )

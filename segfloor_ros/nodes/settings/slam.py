@@ -98,12 +98,6 @@ class StereoSlamNodeSettings(StereoSlamSettings, NodeSettings):
         within=(3, 100),
         live=True,
     )
-    bit_depth: int = setting(
-        0,
-        'Bits used in the pixels of 16-bit images; 0 takes it from the brightest so far.',
-        unit='bits',
-        within=(0, 16),
-    )
 
     @property
     def gives_mount(self) -> bool:
