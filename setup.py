@@ -103,6 +103,7 @@ setup(
         'test': ['onnx>=1.16', 'pytest', 'pytest-timeout', 'pytest-xdist'],
         'dev': [
             'colcon-common-extensions',
+            'mike>=2.1',
             'mkdocs-material>=9.5',
             'mypy',
             'onnx>=1.16',

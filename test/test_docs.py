@@ -1,6 +1,8 @@
 """The handwritten pages name what there is."""
 
 import dataclasses
+import json
+import os
 import re
 import subprocess
 import sys
@@ -157,6 +159,31 @@ def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path) -> Non
     home = (tmp_path / 'index.html').read_text()
     assert 'images/demo.gif' in home
     assert (tmp_path / 'images' / 'demo.gif').stat().st_size < 3e6
+
+
+@pytest.mark.slow
+def test_the_workflow_publishes_each_version_of_the_site(tmp_path) -> None:
+    pytest.importorskip('mike', reason='mike is not installed')
+    source, origin, clone = DOCS.parent, tmp_path / 'origin', tmp_path / 'clone'
+    if not (source / '.git').exists():
+        pytest.skip('no git repository')
+    subprocess.run(['git', 'clone', '-q', '--bare', source, origin], check=True)
+    subprocess.run(['git', 'clone', '-q', origin, clone], check=True)
+    job = yaml.safe_load((source / '.github' / 'workflows' / 'docs.yml').read_text())
+    steps = [step for step in job['jobs']['publish']['steps'] if 'run' in step]
+    programs = f'{Path(sys.executable).parent}:{os.environ["PATH"]}'
+    for kind, name in (('branch', 'main'), ('tag', 'v9.8.7')):
+        for step in steps:
+            if 'pip install' in step['run'] or kind not in step.get('if', kind):
+                continue
+            environment = {**os.environ, 'GITHUB_REF_NAME': name, 'PATH': programs}
+            command = ['bash', '-ec', step['run']]
+            subprocess.run(command, cwd=clone, env=environment, check=True, capture_output=True)
+    shown = ['git', 'show', 'gh-pages:versions.json']
+    versions = json.loads(subprocess.run(shown, cwd=origin, capture_output=True, check=True).stdout)
+    assert [(one['version'], one['aliases']) for one in versions] == [
+        ('dev', []), ('9.8.7', ['latest'])
+    ]  # fmt: skip
 
 
 def test_how_to_cite_names_the_version() -> None:
