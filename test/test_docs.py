@@ -141,6 +141,23 @@ def test_the_basic_settings_are_few_have_their_defaults_and_are_those_of_the_pag
     assert set().union(*rows) - STAGE_SETTINGS.keys() == set().union(of_all, *sections.values())
 
 
+def test_a_user_can_read_the_pages_in_an_hour_and_a_half() -> None:
+    assert sum(len(page.read_text().split()) for page in DOCS.glob('*.md')) <= 20_000
+
+
+def test_each_camera_has_a_picture_and_a_launch_line() -> None:
+    page = (DOCS / 'cameras.md').read_text()
+    launch = (DOCS.parent / 'launch_configs' / 'segfloor.launch.py').read_text()
+    cameras = launch.partition('CAMERAS = {')[2].partition('\n}\n')[0]
+    known = set(re.findall(r"^    '(\w+)': {$", cameras, re.MULTILINE))
+    assert set(re.findall(r'camera:=(\w+)', page)) <= known
+    stereo = {name for name in known if not name.endswith('_depth')}
+    assert stereo <= set(re.findall(r'\w+', page))
+    for section in page.split('\n## ')[1:]:
+        is_other = section.startswith('Any other')
+        assert '```sh\n' in section and ('](images/cameras/' in section or is_other), section
+
+
 @pytest.mark.parametrize('page', figures.PAGES, ids=lambda path: path.name)
 def test_the_tables_of_the_pages_hold_the_figures_that_were_measured(page) -> None:
     text = page.read_text()
