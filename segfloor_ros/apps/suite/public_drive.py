@@ -56,8 +56,8 @@ def fetched(folder: Path, progress: Callable[[int], None] = lambda _: None) -> P
 
 def _fetched(url: str, names: list[str], folder: Path) -> Iterator[None]:
     """Fetch files out of an archive; yield after each."""
+    system, path = open_system(url)
     try:
-        system, path = open_system(url)
         with (
             system.open(path, block_size=BLOCK_BYTES) as remote,
             zipfile.ZipFile(remote) as archive,
@@ -72,8 +72,7 @@ def _fetched(url: str, names: list[str], folder: Path) -> Iterator[None]:
                 yield
     except Exception as error:  # whatever it is that the libraries for networks raise
         why = ' '.join(str(error).split()) or type(error).__name__
-        why = why if isinstance(error, InputError) else f'{url}: cannot be read ({why})'
         raise InputError(
-            f'{why}; what came is kept: try again, or unpack {url} in {folder} by other means, and '
-            'call this again'
+            f'{url}: cannot be read ({why}); what came is kept: try again, or fetch '
+            f'{" and ".join(files_by_url())} by other means and unpack both in {folder}'
         ) from None
