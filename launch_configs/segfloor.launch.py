@@ -193,7 +193,8 @@ def make_nodes(context: LaunchContext) -> list[Node]:
     # Without a word on the input, that of the parameter file holds.
     given = () if with_camera and not source else ('-p', as_text('input', source, with_camera))
     if lossless.lower() != 'auto' or (with_camera and source):
-        is_recording = not source.removeprefix('/dev/video').isdigit()
+        devices = [word.strip().removeprefix('/dev/video') for word in source.split(',')]
+        is_recording = not all(word.isdigit() for word in devices)
         slows_down = is_recording if lossless.lower() == 'auto' else truth('lossless', lossless)
         given = (*given, '-p', f'lossless:={str(slows_down).lower()}')
     maps = of_maps(context)

@@ -146,6 +146,8 @@ def test_what_the_arguments_say_is_handed_on(launched) -> None:
         ({'input': '/a'}, 'true'),
         ({'input': '/dev/video0'}, 'false'),
         ({'input': '0'}, 'false'),
+        ({'input': '0,2'}, 'false'),
+        ({'input': '/dev/video0,/dev/video2'}, 'false'),
         ({'input': '/a', 'lossless': 'false'}, 'false'),
         ({'camera': 'true', 'lossless': 'yes'}, 'true'),
     ):
