@@ -313,7 +313,7 @@ def simulate(
     ] = None,
     set_values: terminal.SceneValues = None,
     floor_every: Annotated[
-        int, number_option('A true floor mask every so many frames; 0: none.', 0)
+        int, number_option('Write a true floor mask every N frames; 0: none.', 0)
     ] = 10,
     disparity: Annotated[
         bool, typer.Option('--disparity', help='With each mask the true disparity (1/256 px).')
@@ -325,9 +325,7 @@ def simulate(
             help='With each mask the class of each pixel, and which person or car it is.',
         ),
     ] = False,
-    supersampling: Annotated[
-        int, number_option('Render so many times finer than the image.', 1, 4)
-    ] = 1,
+    supersampling: Annotated[int, number_option('Render N times finer than the image.', 1, 4)] = 1,
     list_scenes: Annotated[
         bool,
         typer.Option(
