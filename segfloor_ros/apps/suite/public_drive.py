@@ -71,7 +71,8 @@ def _fetched(url: str, names: list[str], folder: Path) -> Iterator[None]:
                 (scratch / target.name).rename(target)
                 yield
     except Exception as error:  # whatever it is that the libraries for networks raise
-        why = ' '.join(str(error).split()) or type(error).__name__
+        is_missing = isinstance(error, FileNotFoundError)
+        why = 'not found' if is_missing else ' '.join(str(error).split()) or type(error).__name__
         raise InputError(
             f'{url}: cannot be read ({why}); what came is kept: try again, or fetch '
             f'{" and ".join(files_by_url())} by other means and unpack both in {folder}'

@@ -149,6 +149,13 @@ def test_without_network_one_line_says_what_to_do(tmp_path, monkeypatch) -> None
     assert not (tmp_path / 'o').exists()
 
 
+def test_an_archive_that_is_gone_is_named(archives, tmp_path) -> None:
+    (path,) = archives.rglob('*_calib.zip')
+    path.unlink()
+    with pytest.raises(InputError, match=r'_calib\.zip: cannot be read \(not found\);'):
+        fetched(tmp_path)
+
+
 def test_a_file_that_is_there_stays(archives, tmp_path) -> None:
     mine = tmp_path / public_drive.DAY / 'calib_cam_to_cam.txt'
     mine.parent.mkdir()
