@@ -175,6 +175,7 @@ def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path) -> Non
     assert renamed <= {path.relative_to(tmp_path) for path in tmp_path.rglob('*.html')}
     home = (tmp_path / 'index.html').read_text()
     assert 'images/demo.gif' in home
+    assert 'site.css' in home
     assert (tmp_path / 'images' / 'demo.gif').stat().st_size < 3e6
 
 
