@@ -94,7 +94,7 @@ setup(
     extras_require={
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'evaluate': ['evo>=1.28'],
-        'cluster': ['distributed>=2024.5', 'fsspec>=2024.5'],
+        'cluster': ['distributed>=2024.5', 'fsspec[http]>=2024.5'],
         'sim': ['mujoco>=3.3'],
         'onnx': ['onnxruntime>=1.17'],
         'view': ["rerun-sdk>=0.41; python_version >= '3.11'"],
@@ -103,6 +103,7 @@ setup(
         'test': ['onnx>=1.16', 'pytest', 'pytest-timeout', 'pytest-xdist'],
         'dev': [
             'colcon-common-extensions',
+            'mike>=2.1',
             'mkdocs-material>=9.5',
             'mypy',
             'onnx>=1.16',

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import yaml
 from topic_texts import ABOUT
 
 from segfloor_ros.core.settings import SettingSpec
@@ -27,6 +28,8 @@ from segfloor_ros.nodes.messages.topics import (
 )
 
 PAGES = Path(__file__).parent / 'nodes'
+BASIC = yaml.safe_load((Path(__file__).parents[1] / 'params' / 'basic.yaml').read_text())
+"""The parameters that most robots need, by section; all others are advanced."""
 
 PURPOSE = {
     CAMERA: """\
@@ -56,43 +59,43 @@ and by its height.""",
 Builds the occupancy grid from the labelled points, the rays to floor points and the floor scans. It
 follows every later correction of the keyframes.""",
     ROBOT: """\
-A differential-drive robot in a rendered scene, in place of a camera's driver: it drives as it is
-told, slips and runs into things (MuJoCo), and publishes what its camera, wheels and IMU measure,
-and what is true. It needs the extra `sim`. [How to explore](../explore.md) with it.""",
+A differential-drive robot in a rendered scene (MuJoCo), in place of a camera's driver. It takes
+`cmd_vel`, slips and collides, and publishes what its camera, wheels and IMU measure, and the truth.
+It needs the extra `sim`. [How to explore](../explore.md) with it.""",
     MASKS: """\
-Runs a segmentation network beside the other nodes: on every keyframe, and on the newest left image
-whenever it is done with the one before. Masks that come late are taken into account: points of
-their keyframe are taken back, and the floor of a keyframe waits for its mask while this node runs.
+Runs a segmentation network on every keyframe, and on the newest left image when it is free. Late
+masks count: they remove points of their keyframe. The floor of a keyframe waits for its mask while
+this node runs.
 [The network's files](../semantics.md).""",
 }
 
 PAUSE, RESET = ('`~/pause`', '`std_srvs/srv/SetBool`'), ('`~/reset`', '`std_srvs/srv/Trigger`')
-PAUSING = 'Pause (true): receive and process nothing, keep the map. Go on (false).'
+PAUSING = 'Pause (true): receive and process nothing, keep the map. Resume (false).'
 NEW_MAP = 'Drop the map and begin with an empty one at the next keyframe.'
 
 SERVICES = {
     CAMERA: [
-        (*PAUSE, 'Pause (true) or go on (false) with the recording.'),
+        (*PAUSE, 'Pause (true) or resume (false) the recording.'),
         (*RESET, 'Begin with the first frame again.'),
     ],
     SLAM: [
         (*PAUSE, PAUSING),
         (
             *RESET,
-            'Drop the map and begin with that of `load_map`, or an empty one. The nodes behind it '
-            'learn it from `keyframe/map_start` and drop theirs. The same happens when the stamps '
+            'Drop the map and begin with that of `load_map`, or an empty one. The other nodes drop '
+            'theirs (`keyframe/map_start`). The same happens when the stamps '
             'of the images go back by more than half a second, as when a recording is played '
             'again.',
         ),
         (
             '`~/load_map`',
             '`std_srvs/srv/Trigger`',
-            'Go on with the map of the file `load_map`; one that is no map changes nothing.',
+            'Continue the map of the file `load_map`; a file that is no map changes nothing.',
         ),
         (
             '`~/save_map`',
             '`std_srvs/srv/Trigger`',
-            'Write the whole map, with what the nodes behind know of it, to the file `save_map`.',
+            'Write the whole map, with the parts of the other nodes, to the file `save_map`.',
         ),
         (
             '`~/prune_map`',
@@ -108,12 +111,12 @@ SERVICES = {
         ),
     ],
     ROBOT: [
-        (*PAUSE, 'Let the time stand still (true) or go on (false).'),
+        (*PAUSE, 'Pause (true) or resume (false) its time.'),
         (*RESET, 'Put the robot back to where it started.'),
     ],
     MASKS: [
-        (*PAUSE, 'Pause (true): look at no image. Go on (false).'),
-        (*RESET, 'Forget the images that wait.'),
+        (*PAUSE, 'Pause (true): process no image. Resume (false).'),
+        (*RESET, 'Drop the images that wait.'),
     ],
     FLOOR: [(*PAUSE, PAUSING), (*RESET, NEW_MAP)],
     CLOUD: [(*PAUSE, PAUSING), (*RESET, NEW_MAP)],
@@ -158,7 +161,7 @@ STATUS = {
     GRID: 'One status per keyframe: OK, or ERROR with the reason, e.g. which topic has not '
     'delivered. Values: `processing_ms`, `rss_mb`.',
     ROBOT: 'One status per frame sent (`frame_index`).',
-    MASKS: 'One status per image looked at.',
+    MASKS: 'One status per image processed.',
 }
 
 
@@ -175,18 +178,27 @@ def page(node: str) -> str:
         or f'Nothing (at rate 0 or lossless: {", ".join(f"`{name}`" for name in PACED_BY)}).',
         '## Publishes',
         _topics([*published_by(node, alternatives=True), DIAGNOSTICS], are_published=True),
-        STATUS[node] + ' Once a second `connections` tells the subscribers of each topic, and '
-        '`health` how the node fares: its `state`, `rate_hz` and `delay_s` of each input, how many '
-        'keyframes or frames were `processed`, `failed` or `dropped`, `processing_ms`, `rss_mb`, '
-        'and in words what is wrong and what to do about it.',
+        STATUS[node] + ' Once a second `connections` lists the subscribers of each topic, and '
+        '`health` has the state of the node: `state`, `rate_hz` and `delay_s` of each input, how '
+        'many keyframes or frames were `processed`, `failed` or `dropped`, `processing_ms`, '
+        '`rss_mb`, and in words what is wrong and the remedy.',
     ]
     sections += ['## Services', _table(('service', 'type', 'what it does'), SERVICES[node])]
     sections += [MANAGED]
     if node in (SLAM, FLOOR, CLOUD):
         sections += [ON_DEMAND]
-    sections += ['## Parameters', _parameters(stage)]
-    if own:
-        sections += ['Only the node has these; `segfloor run` passes over them:', _parameters(own)]
+    if node in STAGE_SETTINGS:
+        names_of = [BASIC.get(section, {}) for section in (f'/**/{node}', '/**')]
+        basic = [name for values in names_of for name in values.get('ros__parameters', {})]
+        specs = {spec.name: spec for spec in (*stage, *own)}
+        first = [specs.pop(name) for name in basic if name in specs]
+        sections += ['## Basic parameters', _parameters(first)]
+        sections += ['## Advanced parameters', _parameters(list(specs.values()))]
+    else:
+        sections += ['## Parameters', _parameters([*stage, *own])]
+    if own and node in STAGE_SETTINGS:
+        of_node = ', '.join(f'`{spec.name}`' for spec in own)
+        sections.append(f'`segfloor run` ignores what only the node has: {of_node}.')
     sections.append(
         'Live parameters can be set while the node runs; the others are read at its start.'
     )

@@ -17,7 +17,7 @@ ABOUT = {
     ),
     'cmd_vel': (
         'How to drive: linear.x in m/s, angular.z in rad/s; by parameter geometry_msgs/msg/Twist. '
-        'In step with who drives, its stamp is that of the image it answers.'
+        'With rate 0 its stamp is that of the image it answers.'
     ),
     'ground_truth': 'Where base_link truly is in world, at every image.',
     'contact': 'When the robot runs into something, where, in base_link (m).',
@@ -30,12 +30,11 @@ ABOUT = {
     ),
     'pose': (
         'Every tracked frame: base_link in map, with its covariance in the map around it. '
-        'Published while someone listens.'
+        'Published while subscribed to.'
     ),
     'odometry/corrected': (
-        'What came on odometry before the mount of the camera was known, or the map was found '
-        'again: the same frames, corrected once; and frames that saw the place before it was '
-        'certain. For who records.'
+        'For recordings: frames that came on odometry before the mount of the camera or the place '
+        'in the map was known, corrected once.'
     ),
     'pose/corrected': 'The same for `pose`.',
     'dynamic_mask': (
@@ -80,18 +79,18 @@ ABOUT = {
     ),
     'map_points': 'The whole sparse map: x y z in map (m) and id; a removed point disappears.',
     'keyframe/disparity': (
-        'Disparity of the keyframe, 0 where there is no match. Published while someone listens.'
+        'Disparity of the keyframe, 0 where there is no match. Published while subscribed to.'
     ),
     'keyframe/floor_mask': (
         'mono8 on the rectified left image: 255 floor, 127 no evidence, 0 not floor.'
     ),
     'keyframe/floor_overlay': (
         'bgr8, for people: the rectified left image tinted green for floor, blue for no evidence, '
-        'red for not floor. Published while someone listens.'
+        'red for not floor. Published while subscribed to.'
     ),
     'keyframe/v_disparity': (
         'bgr8, for people: the filtered v-disparity (rows: of the de-rolled image; columns: half '
-        "pixels) and the floor's profile in green. Published while someone listens."
+        "pixels) and the floor's profile in green. Published while subscribed to."
     ),
     'keyframe/floor_scan': (
         "How far the floor was seen per bearing, in the base's plane (m); 0: blocked right in "
@@ -99,24 +98,23 @@ ABOUT = {
     ),
     'scan': (
         "How far the floor is free per bearing about ten times a second, in the base's plane (m), "
-        'for a costmap to clear; inf: as far as can be told, -inf: blocked right in front, NaN: '
-        'not seen. Published while someone listens.'
+        'for a costmap to clear; inf: free to the end of the range, -inf: blocked right in front, '
+        'NaN: not seen. Published while subscribed to.'
     ),
     'obstacle_scan': (
         'How far away something stands or walks per bearing about ten times a second, in the '
-        "base's plane (m), for a collision monitor; inf: nothing within `range_max`, as far as its "
-        'error is half a cell. Published while someone listens.'
+        "base's plane (m), for a collision monitor; inf: nothing within `range_max`, where the "
+        'error is half a cell. Published while subscribed to.'
     ),
     'labelled_points': (
         'The sparse map with labels: x y z in map (m), id, confidence (0 to 1), label (0 unknown, '
         '1 floor, 2 obstacle).'
     ),
-    'floor_points': 'The floor points alone: x y z id. Published while someone listens.',
+    'floor_points': 'The floor points alone: x y z id. Published while subscribed to.',
     'obstacle_points': (
-        'What the map may not hold yet: the obstacle points that the newest keyframe has seen and '
-        'that do not stand alone (three within a cell): x y z id. Published while someone listens: '
-        'at every keyframe, and empty twice a second while the camera is tracked but makes none; '
-        'again for who begins to listen. With a loaded map that is not driven on, those of the map.'
+        'Obstacle points of the newest keyframe with two neighbours within a cell, since the map '
+        'may lack them: x y z id. Published while subscribed to: at every keyframe, again for '
+        'each new subscriber, and empty twice a second in between. In a loaded map, its points.'
     ),
     'keyframe/done': (
         'The header of every keyframe that goes no further: it is in the map, or a node could not '
@@ -141,6 +139,6 @@ for _side in ('left', 'right'):
         f'keyframe/{_rect}': f'{_name} of the keyframe, rectified, mono8.',
         f'keyframe/{_side}/camera_info': f'Calibration for keyframe/{_rect}.',
         f'frame/{_rect}': 'Every tracked frame, rectified, some 240 pixels wide; published while '
-        'someone listens.',
+        'subscribed to.',
         f'frame/{_side}/camera_info': f'Calibration for frame/{_rect}.',
     }

@@ -11,25 +11,29 @@ MIDDLEWARE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
 ARGUMENTS = {
-    'rate': ('1.0', 'Speed against real time.'),
-    'delay': ('5.0', 'Seconds until the player begins, so that the nodes are connected.'),
-    'namespace': ('', 'Namespace of all nodes and topics.'),
-    'params_file': (['params', 'default.yaml'], 'Parameter file for all nodes.'),
-    'composed': ('false', 'Run all nodes as one program, for small machines: true or false.'),
-    'log_level': ('info', 'From which level on the nodes log.'),
-    'left_image': ('', 'Topic of the left images, by default left/image_raw or left/image_rect.'),
-    'right_image': ('', 'Topic of the right images.'),
-    'left_camera_info': ('', 'Topic of the calibration of the left camera.'),
-    'right_camera_info': ('', 'Topic of the calibration of the right camera.'),
-    'depth': ('', 'Topic of depth images, by default depth/image_raw.'),
-    'odometry': ('', 'Topic of the odometry of the wheels, by default wheel_odometry.'),
-    'imu': ('', 'Topic of the IMU, by default imu.'),
     'camera': (
         'false',
         'The camera of the recording, whose driver has named the topics: realsense, zed, oak, '
         'orbbec; or false.',
     ),
+    'left_image': ('', 'Topic of the left images, by default left/image_raw or left/image_rect.'),
+    'right_image': ('', 'Topic of the right images.'),
+    'odometry': ('', 'Topic of the odometry of the wheels, by default wheel_odometry.'),
+    'imu': ('', 'Topic of the IMU, by default imu.'),
+    'rate': ('1.0', 'Speed against real time.'),
+    'params_file': (['params', 'default.yaml'], 'Parameter file for all nodes.'),
+    'namespace': ('', 'Namespace of all nodes and topics.'),
+    'composed': ('false', 'Run all nodes as one program, for small machines: true or false.'),
     'rviz': ('false', 'Show the map in RViz: true or false.'),
+    'left_camera_info': (
+        '',
+        'Advanced. Topic of the calibration of the left camera, by default camera_info beside its '
+        'images.',
+    ),
+    'right_camera_info': ('', 'Advanced. Topic of the calibration of the right camera, likewise.'),
+    'depth': ('', 'Advanced. Topic of depth images, by default depth/image_raw.'),
+    'delay': ('5.0', 'Advanced. Seconds until the player begins, so that the nodes are connected.'),
+    'log_level': ('info', 'Advanced. From which level on the nodes log.'),
 }
 """By name default and description; a list is a file of the package."""
 CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}

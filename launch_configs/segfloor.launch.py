@@ -2,7 +2,7 @@
 driver.
 """
 
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -18,84 +18,55 @@ CAMERAS = {
     'realsense': {
         'left_image': '/camera/camera/infra1/image_rect_raw',
         'right_image': '/camera/camera/infra2/image_rect_raw',
-        'left_camera_info': '/camera/camera/infra1/camera_info',
-        'right_camera_info': '/camera/camera/infra2/camera_info',
         'depth': '/camera/camera/depth/image_rect_raw',
         'imu': '/camera/camera/imu',
     },
     'zed': {
         'left_image': '/zed/zed_node/left/color/rect/image',
         'right_image': '/zed/zed_node/right/color/rect/image',
-        'left_camera_info': '/zed/zed_node/left/color/rect/camera_info',
-        'right_camera_info': '/zed/zed_node/right/color/rect/camera_info',
         'depth': '/zed/zed_node/depth/depth_registered',
         'imu': '/zed/zed_node/imu/data',
     },
     'oak': {
         'left_image': '/oak/left/image_rect',
         'right_image': '/oak/right/image_rect',
-        'left_camera_info': '/oak/left/camera_info',
-        'right_camera_info': '/oak/right/camera_info',
         'depth': '/oak/stereo/image_raw',
         'imu': '/oak/imu/data',
     },
     'orbbec': {
         'left_image': '/camera/left_ir/image_raw',
         'right_image': '/camera/right_ir/image_raw',
-        'left_camera_info': '/camera/left_ir/camera_info',
-        'right_camera_info': '/camera/right_ir/camera_info',
         'depth': '/camera/depth/image_raw',
         'imu': '/camera/gyro_accel/sample',
     },
     'realsense_depth': {
         'left_image': '/camera/camera/color/image_raw',
-        'left_camera_info': '/camera/camera/color/camera_info',
         'depth': '/camera/camera/aligned_depth_to_color/image_raw',
         'imu': '/camera/camera/imu',
     },
     'zed_depth': {
         'left_image': '/zed/zed_node/left/color/rect/image',
-        'left_camera_info': '/zed/zed_node/left/color/rect/camera_info',
         'depth': '/zed/zed_node/depth/depth_registered',
         'imu': '/zed/zed_node/imu/data',
     },
     'oak_depth': {
         'left_image': '/oak/rgb/image_raw',
-        'left_camera_info': '/oak/rgb/camera_info',
         'depth': '/oak/stereo/image_raw',
         'imu': '/oak/imu/data',
     },
     'orbbec_depth': {
         'left_image': '/camera/color/image_raw',
-        'left_camera_info': '/camera/color/camera_info',
         'depth': '/camera/depth/image_raw',
         'imu': '/camera/gyro_accel/sample',
     },
 }
 """Topics by the names that the drivers document; params/camera_NAME.yaml says what to ask of them.
 """
-INPUTS = {
-    'left_camera_info': 'left/camera_info',
-    'right_camera_info': 'right/camera_info',
-    'depth': 'depth/image_raw',
-    'odometry': 'wheel_odometry',
-    'imu': 'imu',
-}
+INPUTS = {'depth': 'depth/image_raw', 'odometry': 'wheel_odometry', 'imu': 'imu'}
 """Arguments, and the topics of the nodes that they name."""
 
 
 ARGUMENTS = {
-    'namespace': ('', 'Namespace of all nodes and topics.'),
-    'params_file': (
-        ['params', 'default.yaml'],
-        'Parameter file for all nodes; arguments win over it.',
-    ),
-    'use_sim_time': ('false', 'Take the time from /clock: true or false.'),
-    'input': (
-        '',
-        'Recording or device to play; empty: a camera driver publishes left/image_raw, '
-        'right/image_raw and their camera_info.',
-    ),
     'camera': (
         'auto',
         'A camera whose driver runs: realsense, zed, oak or orbbec, or one of these with _depth '
@@ -105,39 +76,54 @@ ARGUMENTS = {
     ),
     'left_image': ('', 'Topic of the left images, by default left/image_raw or left/image_rect.'),
     'right_image': ('', 'Topic of the right images.'),
-    'left_camera_info': ('', 'Topic of the calibration of the left camera.'),
-    'right_camera_info': ('', 'Topic of the calibration of the right camera.'),
-    'depth': ('', 'Topic of depth images, by default depth/image_raw.'),
     'odometry': ('', 'Topic of the odometry of the wheels, by default wheel_odometry.'),
     'imu': ('', 'Topic of the IMU, by default imu.'),
-    'lossless': (
-        'auto',
-        'A recording slows down rather than lose a frame where the nodes cannot follow: true, '
-        'false, or auto, which is true unless input is a device.',
+    'input': (
+        '',
+        'Recording or device to play; empty: a camera driver publishes left/image_raw, '
+        'right/image_raw and their camera_info.',
     ),
+    'params_file': (
+        ['params', 'default.yaml'],
+        'Parameter file for all nodes; arguments win over it.',
+    ),
+    'namespace': ('', 'Namespace of all nodes and topics.'),
     'load_map': ('', 'Saved map to go on with; empty: begin with an empty one.'),
     'localize': (
         'false',
         'Only find the robot in the map of load_map, and add nothing to it: true or false.',
     ),
     'composed': ('false', 'Run all nodes as one program, for small machines: true or false.'),
+    'rviz': ('false', 'Show the map in RViz: true or false.'),
+    'left_camera_info': (
+        '',
+        'Advanced. Topic of the calibration of the left camera, by default camera_info beside its '
+        'images.',
+    ),
+    'right_camera_info': ('', 'Advanced. Topic of the calibration of the right camera, likewise.'),
+    'depth': ('', 'Advanced. Topic of depth images, by default depth/image_raw.'),
+    'use_sim_time': ('false', 'Advanced. Take the time from /clock: true or false.'),
+    'lossless': (
+        'auto',
+        'Advanced. A recording slows down rather than lose a frame where the nodes cannot follow: '
+        'true, false, or auto, which is true unless input is a device.',
+    ),
     'autostart': (
         'true',
-        'Nodes begin to work by themselves: true, or false, with which they wait for a lifecycle '
-        'manager.',
+        'Advanced. Nodes begin to work by themselves: true, or false, with which they wait for a '
+        'lifecycle manager.',
     ),
     'respawn': (
         'false',
-        'Start a node again that has died: true or false. It goes on with what it knew.',
+        'Advanced. Start a node again that has died: true or false. It goes on with what it knew.',
     ),
     'namespaced_tf': (
         'false',
-        'Take /tf and /tf_static into the namespace, as Nav2 does for several robots: true or '
-        'false.',
+        'Advanced. Take /tf and /tf_static into the namespace, as Nav2 does for several robots: '
+        'true or false.',
     ),
-    'log_level': ('info', 'From which level on the nodes log.'),
-    'rviz': ('false', 'Show the map in RViz: true or false.'),
-    'rviz_config': (['launch_configs', 'segfloor.rviz'], 'Layout of RViz.'),
+    'log_level': ('info', 'Advanced. From which level on the nodes log.'),
+    'rviz_config': (['launch_configs', 'segfloor.rviz'], 'Advanced. Layout of RViz.'),
 }
 """By name default and description; a list is a file of the package."""
 CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
@@ -207,7 +193,8 @@ def make_nodes(context: LaunchContext) -> list[Node]:
     # Without a word on the input, that of the parameter file holds.
     given = () if with_camera and not source else ('-p', as_text('input', source, with_camera))
     if lossless.lower() != 'auto' or (with_camera and source):
-        is_recording = not source.removeprefix('/dev/video').isdigit()
+        devices = [word.strip().removeprefix('/dev/video') for word in source.split(',')]
+        is_recording = not all(word.isdigit() for word in devices)
         slows_down = is_recording if lossless.lower() == 'auto' else truth('lossless', lossless)
         given = (*given, '-p', f'lossless:={str(slows_down).lower()}')
     maps = of_maps(context)
@@ -257,13 +244,16 @@ def remapped_topics(
     def topic(argument: str) -> str:
         return LaunchConfiguration(argument).perform(context) or preset.get(argument, '')
 
-    for side in ('left', 'right'):
+    for side, calibration in (('left', 'left_camera_info'), ('right', 'right_camera_info')):
         image = topic(f'{side}_image').removesuffix('/compressed')
         if image:
             kind_name = 'rect' if 'rect' in image else 'raw'
             name = f'{side}/image_{kind_name}'
             found += [(name, image), (f'{name}/compressed', f'{image}/compressed')]
             kind = ('-p', f'image_kind:={kind_name}')
+        beside = str(PurePosixPath(image).with_name('camera_info')) if image else ''
+        info = topic(calibration) or beside
+        found += [(f'{side}/camera_info', info)] if info else []
     found += [(name, topic(argument)) for argument, name in INPUTS.items() if topic(argument)]
     return found, kind
 

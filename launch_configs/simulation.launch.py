@@ -16,10 +16,10 @@ ARGUMENTS = {
     'params_file': (['params', 'simulation.yaml'], 'Parameter file for all nodes.'),
     'composed': ('false', 'Run the mapping nodes as one program: true or false.'),
     'load_map': ('', 'Saved map to go on with; empty: begin with an empty one.'),
-    'log_level': ('info', 'From which level on the nodes log.'),
     'rviz': ('false', 'Show the map in RViz: true or false.'),
     'nav2': ('false', 'Start navigation_launch.py of nav2_bringup: true or false.'),
     'nav2_params': (['params', 'nav2.yaml'], 'Parameter file for Nav2.'),
+    'log_level': ('info', 'Advanced. From which level on the nodes log.'),
 }
 """By name default and description; a list is a file of the package."""
 CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal'], 'nav2': ['true', 'false']}

@@ -34,6 +34,17 @@ def test_workflows_call_scripts_that_there_are(workflow) -> None:
     assert set(called) <= {script.name for script in SCRIPTS}
 
 
+@pytest.mark.parametrize('form', sorted(WORKFLOWS.parent.glob('ISSUE_TEMPLATE/*.yml')))
+def test_the_forms_of_issues_ask_for_what_there_is(form) -> None:
+    asked = yaml.safe_load(form.read_text())
+    assert asked['name'] and asked['description']
+    fields = [field for field in asked['body'] if field['type'] != 'markdown']
+    assert len({field['id'] for field in fields}) == len(fields) >= 2
+    assert all(field['attributes']['label'] for field in fields)
+    named = re.findall(r'docs/[\w./]+\.md', form.read_text())
+    assert all((REPOSITORY / page).is_file() for page in named)
+
+
 def test_what_is_published_is_what_was_built_and_tried_and_no_token_is_kept() -> None:
     text = (WORKFLOWS / 'release.yml').read_text()
     build, publish = yaml.safe_load(text)['jobs'].values()

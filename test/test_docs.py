@@ -1,6 +1,8 @@
 """The handwritten pages name what there is."""
 
 import dataclasses
+import json
+import os
 import re
 import subprocess
 import sys
@@ -139,6 +141,23 @@ def test_the_basic_settings_are_few_have_their_defaults_and_are_those_of_the_pag
     assert set().union(*rows) - STAGE_SETTINGS.keys() == set().union(of_all, *sections.values())
 
 
+def test_a_user_can_read_the_pages_in_an_hour_and_a_half() -> None:
+    assert sum(len(page.read_text().split()) for page in DOCS.glob('*.md')) <= 20_000
+
+
+def test_each_camera_has_a_picture_and_a_launch_line() -> None:
+    page = (DOCS / 'cameras.md').read_text()
+    launch = (DOCS.parent / 'launch_configs' / 'segfloor.launch.py').read_text()
+    cameras = launch.partition('CAMERAS = {')[2].partition('\n}\n')[0]
+    known = set(re.findall(r"^    '(\w+)': {$", cameras, re.MULTILINE))
+    assert set(re.findall(r'camera:=(\w+)', page)) <= known
+    stereo = {name for name in known if not name.endswith('_depth')}
+    assert stereo <= set(re.findall(r'\w+', page))
+    for section in page.split('\n## ')[1:]:
+        is_other = section.startswith('Any other')
+        assert '```sh\n' in section and ('](images/cameras/' in section or is_other), section
+
+
 @pytest.mark.parametrize('page', figures.PAGES, ids=lambda path: path.name)
 def test_the_tables_of_the_pages_hold_the_figures_that_were_measured(page) -> None:
     text = page.read_text()
@@ -156,7 +175,33 @@ def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path) -> Non
     assert renamed <= {path.relative_to(tmp_path) for path in tmp_path.rglob('*.html')}
     home = (tmp_path / 'index.html').read_text()
     assert 'images/demo.gif' in home
+    assert 'site.css' in home
     assert (tmp_path / 'images' / 'demo.gif').stat().st_size < 3e6
+
+
+@pytest.mark.slow
+def test_the_workflow_publishes_each_version_of_the_site(tmp_path) -> None:
+    pytest.importorskip('mike', reason='mike is not installed')
+    source, origin, clone = DOCS.parent, tmp_path / 'origin', tmp_path / 'clone'
+    if not (source / '.git').exists():
+        pytest.skip('no git repository')
+    subprocess.run(['git', 'clone', '-q', '--bare', source, origin], check=True)
+    subprocess.run(['git', 'clone', '-q', origin, clone], check=True)
+    job = yaml.safe_load((source / '.github' / 'workflows' / 'docs.yml').read_text())
+    steps = [step for step in job['jobs']['publish']['steps'] if 'run' in step]
+    programs = f'{Path(sys.executable).parent}:{os.environ["PATH"]}'
+    for kind, name in (('branch', 'main'), ('tag', 'v9.8.7')):
+        for step in steps:
+            if 'pip install' in step['run'] or kind not in step.get('if', kind):
+                continue
+            environment = {**os.environ, 'GITHUB_REF_NAME': name, 'PATH': programs}
+            command = ['bash', '-ec', step['run']]
+            subprocess.run(command, cwd=clone, env=environment, check=True, capture_output=True)
+    shown = ['git', 'show', 'gh-pages:versions.json']
+    versions = json.loads(subprocess.run(shown, cwd=origin, capture_output=True, check=True).stdout)
+    assert [(one['version'], one['aliases']) for one in versions] == [
+        ('dev', []), ('9.8.7', ['latest'])
+    ]  # fmt: skip
 
 
 def test_how_to_cite_names_the_version() -> None:

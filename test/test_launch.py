@@ -65,6 +65,9 @@ def test_every_argument_is_described_and_used(path) -> None:
     assert {name for name in names if source.count(f"'{name}'") > 1} == names
     assert {call.args[0].value for call in named_calls(ast.parse(source))} <= names
     assert {'namespace', 'params_file'} <= names
+    are_advanced = [argument.description.startswith('Advanced. ') for argument in declared]
+    assert are_advanced.count(False) <= 12
+    assert are_advanced == sorted(are_advanced), 'the basic ones come first'
     assert path != SEGFLOOR or names == ARGUMENTS
 
 
@@ -143,6 +146,8 @@ def test_what_the_arguments_say_is_handed_on(launched) -> None:
         ({'input': '/a'}, 'true'),
         ({'input': '/dev/video0'}, 'false'),
         ({'input': '0'}, 'false'),
+        ({'input': '0,2'}, 'false'),
+        ({'input': '/dev/video0,/dev/video2'}, 'false'),
         ({'input': '/a', 'lossless': 'false'}, 'false'),
         ({'camera': 'true', 'lossless': 'yes'}, 'true'),
     ):
@@ -211,6 +216,7 @@ def test_topics_are_arguments(launched) -> None:
     assert remappings(launched()['stereo_slam']) == {}
     rectified = launched(left_image='/l/rect/compressed', right_image='/r/rect/compressed')
     found = remappings(rectified['stereo_slam'])
+    assert found['left/camera_info'] == '/l/camera_info'
     assert found['left/image_rect/compressed'] == '/l/rect/compressed'
     assert 'image_kind:=rect' in after(rectified['stereo_slam'].arguments, '-p')
 

@@ -31,8 +31,12 @@ CONSTANTS = (
     *('tracked_points', 'keyframe_min_frames', 'keyframe_motion_ratio', 'keyframe_turn_rad'),
     *('disparity_offset_sigma_px', 'height_sigma_m', 'max_mask_log_odds', 'max_height_log_odds'),
     *('coarse_above_px', 'obstacle_height_m', 'fill_support', 'fill_gap_m'),
+    *('mask_dilation_px', 'jpeg_quality'),
 )
 GONE = dict.fromkeys(CONSTANTS, 'it is a constant now') | {
+    'bit_depth': 'it follows from the brightest pixel so far',
+    'num_disparities': 'it follows from camera and mount',
+    'disparity_above_horizon': 'rows above the horizon are not matched',
     'level_ground': 'it brought no more than noise',
     'max_hit_error_m': 'it follows from resolution_m',
     'scan_gap_m': 'it follows from step_height_m',

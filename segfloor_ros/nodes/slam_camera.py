@@ -187,7 +187,7 @@ class StereoInput:
         self._is_settled = False
         self._depth_seen_s = 0.0
         self._rectifier: StereoRectifier | None = None
-        self._eight_bit = EightBitScale(self._own.bit_depth)
+        self._eight_bit = EightBitScale()
 
     @property
     def missing_calibrations(self) -> list[str]:

@@ -18,6 +18,7 @@ from rosgraph_msgs.msg import Clock
 from segfloor_ros.core.camera.calibration import StereoCalibration
 from segfloor_ros.core.camera.images import Grey
 from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.pixels import JPEG_QUALITY
 from segfloor_ros.core.camera.recording import (
     DEPTH,
     IMU_FRAME,
@@ -281,8 +282,7 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
     def _image_message(self, stamp_ns: int, frame_id: str, image: Grey) -> Any:
         if not self._compressed:
             return image_message(stamp_ns, frame_id, image)
-        own = self.settings
-        quality = own.jpeg_quality if own.compression == 'jpeg' else None
+        quality = JPEG_QUALITY if self.settings.compression == 'jpeg' else None
         return compressed_message(stamp_ns, frame_id, image, quality)
 
     def _finish(self, level: Level, message: str) -> None:

@@ -71,6 +71,9 @@ def test_not_a_number_means_not_given_only_where_it_is_the_default():
         ('stereo_slam', 'keyframe_turn_rad', 'constant'),
         ('cloud_labelling', 'height_sigma_m', 'constant'),
         ('occupancy_grid', 'max_hit_error_m', 'follows from resolution_m'),
+        ('stereo_slam', 'bit_depth', 'brightest pixel'),
+        ('stereo_camera', 'jpeg_quality', 'constant'),
+        ('floor_segmentation', 'num_disparities', 'camera and mount'),
     ],
 )
 def test_settings_of_earlier_versions_are_named_as_gone(tmp_path, stage, name, why):

@@ -112,17 +112,18 @@ def test_the_camera_waits_for_somebody_who_listens(make_graph, tmp_path) -> None
     assert [to_ns(m.header.stamp) for m in received] == [f.stamp_ns for f in frames]
 
 
-def test_the_camera_compresses_as_it_is_told(make_graph, tmp_path) -> None:
+@pytest.mark.parametrize(('coding', 'quality'), [('jpeg', 90), ('png', None)])
+def test_the_camera_compresses_as_it_is_told(make_graph, tmp_path, coding, quality) -> None:
     (frame,), _ = room_drive(1)
     folder = write_kitti(tmp_path / 'drive', [frame])
-    arguments = {'input': folder, 'image_transport': 'compressed', 'jpeg_quality': 30}
+    arguments = {'input': folder, 'image_transport': 'compressed', 'compression': coding}
     graph = make_graph(*(part for k, v in arguments.items() for part in ('-p', f'{k}:={v}')))
     received = graph.collect('left/image_raw/compressed')
     for name in ('right/image_raw/compressed', 'left/camera_info', 'right/camera_info'):
         graph.collect(name)
     graph.add(make_stereo_camera())
     graph.until(lambda: received, 'the image')
-    expected = compressed_message(frame.stamp_ns, '', frame.left, 30)
+    expected = compressed_message(frame.stamp_ns, '', frame.left, quality)
     assert bytes(received[0].data) == bytes(expected.data)
 
 

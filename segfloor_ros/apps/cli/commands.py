@@ -25,6 +25,7 @@ from segfloor_ros.apps.lockstep import LockstepRun, SaveMasks
 from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.results_folder import OutputFolder
 from segfloor_ros.core.errors import MapError, SettingsError, about
+from segfloor_ros.core.files.whole import read_json
 from segfloor_ros.core.files.writing import add_files, check_target
 from segfloor_ros.core.processes import Interrupt, first_interrupt_noted
 from segfloor_ros.nodes.network_files import open_network
@@ -191,6 +192,15 @@ def demo(
     lockstep: Annotated[
         bool, typer.Option('--lockstep', help='Without ROS: one process in place of five nodes.')
     ] = False,
+    real: Annotated[
+        bool,
+        typer.Option(
+            '--real', help='Map a car on a road instead: 51 public pairs of KITTI, 30 MB to fetch.'
+        ),
+    ] = False,
+    data: Annotated[Path, typer.Option(help='Folder of what --real fetches.')] = Path(
+        'segfloor_kitti'
+    ),
     as_json: terminal.Json = False,
 ) -> None:
     """Map a recorded drive through a corridor with the five nodes and score the map.
@@ -198,22 +208,41 @@ def demo(
     \b
     segfloor demo
     segfloor demo --lockstep --out demo
+    segfloor demo --real --out road
     """
     with terminal.json_alone(as_json):
-        scores = _demo(out, rate, lockstep)
+        scores = _real_demo(out, rate, lockstep, data) if real else _demo(out, rate, lockstep)
     if as_json:
         terminal.print_json(scores)
 
 
 def _demo(out: Path, rate: float, lockstep: bool) -> dict[str, Any]:
-    drive = str(DRIVE / 'drive.mcap')
-    if lockstep or util.find_spec('rclpy') is None:
-        console.print('mapping a simulated drive through a corridor, in one process without ROS')
-        run(input=drive, out=out)
-    else:
-        console.print('replaying a simulated drive through a corridor through the five nodes')
-        replay(input=drive, out=out, rate=rate)
+    drive, what = str(DRIVE / 'drive.mcap'), 'a simulated drive through a corridor'
+    _map_demo(what, lockstep, rate, input=drive, out=out)
     return _print_scores(out)
+
+
+def _map_demo(what: str, lockstep: bool, rate: float, **options: Any) -> None:
+    if lockstep or util.find_spec('rclpy') is None:
+        console.print(f'mapping {what}, in one process without ROS')
+        run(**options)
+    else:
+        console.print(f'replaying {what} through the five nodes')
+        replay(**options, rate=rate)
+
+
+def _real_demo(out: Path, rate: float, lockstep: bool, data: Path) -> dict[str, Any]:
+    # Imported here: fsspec is an extra.
+    from segfloor_ros.apps.suite import public_drive
+
+    console.print(public_drive.ABOUT)
+    count = sum(map(len, public_drive.files_by_url().values()))
+    with terminal.progress_bar('fetching', count) as progress:
+        drive = public_drive.fetched(data, progress)
+    options = {'frames': public_drive.PAIRS, 'params': terminal.params_file(Path('kitti'))}
+    what = 'a car on a road in Karlsruhe'
+    _map_demo(what, lockstep, rate, input=str(drive), out=out, report=True, **options)
+    return read_json(out / 'summary.json', 'a summary')
 
 
 def _print_scores(out: Path) -> dict[str, Any]:
@@ -284,7 +313,7 @@ def simulate(
     ] = None,
     set_values: terminal.SceneValues = None,
     floor_every: Annotated[
-        int, number_option('A true floor mask every so many frames; 0: none.', 0)
+        int, number_option('Write a true floor mask every N frames; 0: none.', 0)
     ] = 10,
     disparity: Annotated[
         bool, typer.Option('--disparity', help='With each mask the true disparity (1/256 px).')
@@ -296,9 +325,7 @@ def simulate(
             help='With each mask the class of each pixel, and which person or car it is.',
         ),
     ] = False,
-    supersampling: Annotated[
-        int, number_option('Render so many times finer than the image.', 1, 4)
-    ] = 1,
+    supersampling: Annotated[int, number_option('Render N times finer than the image.', 1, 4)] = 1,
     list_scenes: Annotated[
         bool,
         typer.Option(

@@ -88,13 +88,7 @@ def open_bag(path: Path, settings: StereoCameraSettings) -> StereoSource:
             sensors.append(RecordedSensor(DEPTH, depth.right, messages, topics is depth))
     read = partial(_entries, path, topics, calibration.camera, settings)
     return StereoSource(
-        str(path),
-        calibration,
-        read,
-        frame_count=count,
-        rate_hz=rate_hz,
-        bit_depth=settings.bit_depth,
-        sensors=sensors,
+        str(path), calibration, read, frame_count=count, rate_hz=rate_hz, sensors=sensors
     )
 
 

@@ -19,10 +19,10 @@ from segfloor_ros.apps.recordings.bag_file import CAMERA_INFO, COMPRESSED, IMAGE
 from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.model import is_disparity
+from segfloor_ros.core.camera.pixels import JPEG_QUALITY
 from segfloor_ros.core.camera.recording import IMU_FRAME, MeasurementLog, RawPair
 from segfloor_ros.core.contracts import ImuSample, Measurement, WheelPose
 from segfloor_ros.core.errors import InputError, os_errors
-from segfloor_ros.core.files.images import JPEG_QUALITY
 from segfloor_ros.core.files.writing import scratch_folder
 from segfloor_ros.core.geometry import make_transform
 from segfloor_ros.nodes.messages.camera_infos import camera_info_message, compressed_message

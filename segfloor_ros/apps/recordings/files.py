@@ -158,7 +158,6 @@ def file_pair_source(
     name: str,
     pairs: Sequence[FilePair],
     calibration: StereoCalibration,
-    bit_depth: int,
     sensors: Sequence[RecordedSensor] = (),
     read_right: Callable[[Path], NDArray[Any]] | None = None,
 ) -> StereoSource:
@@ -181,13 +180,7 @@ def file_pair_source(
 
     stamps = [pair.stamp_ns for pair in pairs]
     source = StereoSource(
-        name,
-        calibration,
-        entries,
-        frame_count=len(pairs),
-        rate_hz=rate_of(stamps),
-        bit_depth=bit_depth,
-        sensors=sensors,
+        name, calibration, entries, frame_count=len(pairs), rate_hz=rate_of(stamps), sensors=sensors
     )
     check_shared_clock(sensors, stamps)
     return source

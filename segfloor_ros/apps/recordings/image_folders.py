@@ -114,7 +114,7 @@ def open_image_folders(folder: Path, settings: StereoCameraSettings) -> StereoSo
         calibration = read_other(raw, size=size, cameras=cameras)
     calibration = calibration or find_calibration(str(folder), near, settings)
     sensors = folder_sensors(folder, settings.ignored_sensors)
-    return files.file_pair_source(str(folder), pairs, calibration, settings.bit_depth, sensors)
+    return files.file_pair_source(str(folder), pairs, calibration, sensors)
 
 
 def _open_depth(folder: Path, left: Sequence[Path], settings: StereoCameraSettings) -> StereoSource:
@@ -222,7 +222,7 @@ def open_euroc(folder: Path, settings: StereoCameraSettings) -> StereoSource:
     pairs = files.pairs_by_stamp(left, right, settings.pairing_tolerance_s, names)
     calibration = find_calibration(str(folder), (root, folder), settings)
     sensors = _sensors(root, folder, calibration, settings)
-    return files.file_pair_source(str(folder), pairs, calibration, settings.bit_depth, sensors)
+    return files.file_pair_source(str(folder), pairs, calibration, sensors)
 
 
 def _root(folder: Path) -> Path:
@@ -305,7 +305,7 @@ def open_kitti(folder: Path, settings: StereoCameraSettings) -> StereoSource:
     calibration = given_calibration(settings)
     calibration = calibration or read_kitti_calibration(calib, *size, (camera, partner))
     sensors = folder_sensors(folder, settings.ignored_sensors)
-    return files.file_pair_source(str(folder), pairs, calibration, settings.bit_depth, sensors)
+    return files.file_pair_source(str(folder), pairs, calibration, sensors)
 
 
 def _cameras(folder: Path) -> tuple[int, int | None]:
@@ -358,9 +358,7 @@ def _depth_source(
 
     found = RecordedSensor(DEPTH, str(pairs[0].right.parent), len(pairs), True)
     others = [sensor for sensor in sensors if sensor.name != DEPTH]
-    return files.file_pair_source(
-        name, pairs, calibration, settings.bit_depth, [found, *others], read_disparity
-    )
+    return files.file_pair_source(name, pairs, calibration, [found, *others], read_disparity)
 
 
 def with_depth(

@@ -102,7 +102,6 @@ class StereoSource:
         *,
         frame_count: int | None,
         rate_hz: float,
-        bit_depth: int = 0,
         sensors: Sequence[RecordedSensor] = (),
     ) -> None:
         self.name = name
@@ -117,7 +116,7 @@ class StereoSource:
         self.skipped_frames = 0
         self._warned_of: dict[str, str] = {}
         self._has_read_pair = self._has_read_mask = False
-        self._eight_bit = EightBitScale(bit_depth)
+        self._eight_bit = EightBitScale()
         self._check_first_pair()
         slowest, fastest = PLAUSIBLE_HZ
         if not slowest <= rate_hz <= fastest:

@@ -110,7 +110,7 @@ def find_recordings(pattern: str) -> dict[str, str]:
             raise InputError(f'{pattern}: no such recording')
         return {_stem(pattern): pattern}
     if is_url(pattern):
-        system, path = _open_system(pattern)
+        system, path = open_system(pattern)
         found = sorted(system.unstrip_protocol(match) for match in system.glob(path))
     else:
         found = sorted(glob.glob(pattern))
@@ -125,7 +125,7 @@ def local_copy(path_or_url: str, folder: Path) -> Path:
     """
     if not is_url(path_or_url):
         return Path(path_or_url)
-    system, path = _open_system(path_or_url)
+    system, path = open_system(path_or_url)
     try:
         # Size, time and tag tell whether what the URL names has changed.
         facts = repr(sorted((k, str(v)) for k, v in system.info(path).items()))
@@ -159,7 +159,8 @@ def digest_of(path: Path) -> str:
     return result.hexdigest()
 
 
-def _open_system(url: str) -> tuple[Any, str]:
+def open_system(url: str) -> tuple[Any, str]:
+    """Return the file system of a URL, and the path in it. Raises InputError."""
     try:
         from fsspec.core import url_to_fs
     except ImportError:

@@ -164,18 +164,16 @@ class EightBitScale:
     part of the noise everywhere, and dark floors keep theirs below bright lamps (Anscombe, The
     transformation of Poisson, binomial and negative-binomial data, 1948). A scale per image would
     change the brightness of the same point from frame to frame. The number of bits in use is
-    declared, or else the smallest usual one that holds all pairs so far: a recording may begin in
-    the dark.
+    the smallest usual one that holds all pairs so far: a recording may begin in the dark.
     """
 
-    def __init__(self, bit_depth: int = 0) -> None:
-        self._is_declared = bit_depth > 0
-        self._use(bit_depth)
+    def __init__(self) -> None:
+        self._use(0)
 
     def __call__(self, left: Grey, right: Grey) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Return both images (H, W) as uint8; 8-bit images pass through."""
         deep = [int(image.max()) for image in (left, right) if image.dtype == np.uint16]
-        if deep and not self._is_declared and max(deep) >= 1 << self._bit_depth:
+        if deep and max(deep) >= 1 << self._bit_depth:
             self._use(next(bits for bits in USUAL_BIT_DEPTHS if max(deep) < 1 << bits))
         return self._scaled(left), self._scaled(right)
 

@@ -16,6 +16,9 @@ from segfloor_ros.core.geometry import Array
 Region = NDArray[np.uint8]
 """A mask (H, W) uint8 of the left image, 255 where something is left out, e.g. moves."""
 
+JPEG_QUALITY = 90
+"""Above this, JPEG images grow much faster than they improve."""
+
 SUBPIXEL = 16
 """OpenCV's semi-global disparities are in 1/16 px, and their number is a multiple of as many."""
 

@@ -40,12 +40,6 @@ class StereoCameraSettings(StageSettings):
     right_calibration: str = setting(
         '', 'Calibration file of the right camera; empty: the one that lies with the recording.'
     )
-    bit_depth: int = setting(
-        0,
-        'Bits used in the pixels of 16-bit images; 0 takes it from the brightest so far.',
-        unit='bits',
-        within=(0, 16),
-    )
     left_image_topic: str = setting('', 'Left image topic in a bag; empty: found by its name.')
     right_image_topic: str = setting('', 'Right image topic in a bag; empty: found by its name.')
     wheel_odometry_topic: str = setting('', 'Wheel odometry topic of a bag; empty: by its type.')

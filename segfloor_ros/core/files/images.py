@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.pixels import Grey, check_size
+from segfloor_ros.core.camera.pixels import JPEG_QUALITY, Grey, check_size
 from segfloor_ros.core.errors import CorruptImageError, InputError
 from segfloor_ros.core.files.whole import read_bytes
 from segfloor_ros.core.standard_error import silent_libraries
@@ -23,10 +23,6 @@ JPEG_START, JPEG_END = b'\xff\xd8', b'\xff\xd9'
 
 GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 COLOUR = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-
-
-JPEG_QUALITY = 90
-"""Above this, JPEG images grow much faster than they improve."""
 
 
 def read_grey(path: Path) -> Grey:

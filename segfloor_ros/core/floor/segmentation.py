@@ -204,14 +204,13 @@ class FloorSegmentation:
         self._mount, self.fixture = mount, Fixture()
 
     def _make_tools(self, mount: Mount) -> None:
-        searched = self._settings.num_disparities or disparity_range(self._camera, mount)
+        searched = disparity_range(self._camera, mount)
         self._matcher = TwoScaleMatcher(-(-searched // 16) * 16)
         self._overhead = OverheadMatcher(self._camera, searched, self._settings)
         self._scanner = FloorScanner(self._camera, mount, self._settings)
 
     def _matched(self, pair: Pair) -> NDArray[np.float32]:
-        settings, camera = self._settings, self._camera
-        top = 0 if settings.disparity_above_horizon else pair.first_row
+        camera, top = self._camera, pair.first_row
         assert self._mount is not None
         fine_rows = last_fine_row(camera, self._mount) - top
         disparity = np.zeros(pair.left.shape, np.float32)

@@ -65,7 +65,7 @@ class NothingMoves:
 class NoLateMasks:
     """No masks come once a keyframe is made."""
 
-    def __init__(self, front_end: FrontEnd, sparse_map: SparseMap, dilation_px: int) -> None:
+    def __init__(self, front_end: FrontEnd, sparse_map: SparseMap) -> None:
         """Need none of it."""
 
     def add(self, stamp_ns: int, mask: Region) -> None:
@@ -156,4 +156,4 @@ class Plugins:
     sensors: BodySensors = field(default_factory=NoSensors)
     rig_check: RigCheck = field(default_factory=TrustedRig)
     session: Callable[[Parts], OneMap] = OneMap
-    late_masks: Callable[[FrontEnd, SparseMap, int], NoLateMasks] = NoLateMasks
+    late_masks: Callable[[FrontEnd, SparseMap], NoLateMasks] = NoLateMasks

@@ -43,12 +43,7 @@ class StereoSlamSettings(StageSettings):
     max_speed_mps: float = setting(
         40.0, 'A motion faster than this is implausible and ends tracking.', within=(0.1, 100.0)
     )
-    detect_moving: bool = setting(True, 'Leave out what moves, as far as the stereo pairs show it.')
-    mask_dilation_px: int = setting(
-        5,
-        'A mask of moving things (`dynamic_mask`, `--masks`) is widened by this much.',
-        within=(0, 100),
-    )
+    detect_moving: bool = setting(True, 'Leave out what moves, by the stereo pairs alone.')
     keyframe_max_frames: int = setting(
         30, 'A new keyframe is due after this many frames (condition A1).', within=(1, 1000)
     )

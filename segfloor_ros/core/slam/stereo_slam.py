@@ -73,7 +73,6 @@ class StereoSlam:
         self.rig = Rig(camera, mount)
         self.map = SparseMap(self.rig)
         self.sessions: list[dict[str, int]] = []
-        self._mask_dilation_px = settings.mask_dilation_px
         self._times = times or StageTimes()
         self.sensors, self.rig_check = plugins.sensors, plugins.rig_check
         self.front_end = FrontEnd(settings, self.map, self.sensors)
@@ -88,7 +87,7 @@ class StereoSlam:
             Parts(self.map, self.front_end, self.back_end, self.sensors, self._moving, search, held)
         )
         self._shows_nothing = False
-        self.late_masks = plugins.late_masks(self.front_end, self.map, self._mask_dilation_px)
+        self.late_masks = plugins.late_masks(self.front_end, self.map)
         self.announce: Callable[[FrameResult, StereoFrame, Region | None], None] | None = None
 
     @property
@@ -187,7 +186,7 @@ class StereoSlam:
             self.rig_check.watch(frame, float(rotation_angle(turned[:3, :3])))
             frame = self.rig_check.corrected(frame)
         border = self._border.see(frame.left)
-        return frame, Images.of(frame, self.rig.camera, border, self._mask_dilation_px)
+        return frame, Images.of(frame, self.rig.camera, border)
 
     def _track(self, frame: StereoFrame, images: Images, fault: str) -> Track | None:
         """Find the pose of a frame in the map; by sensors, or by a search, where that fails."""

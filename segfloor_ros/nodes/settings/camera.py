@@ -33,11 +33,6 @@ class StereoCameraNodeSettings(StereoCameraSettings, NodeSettings):
         'How images are compressed: jpeg, small, or png, without loss.',
         choices=('jpeg', 'png'),
     )
-    jpeg_quality: int = setting(
-        90,
-        'Quality of the JPEG images; above 90 they grow much faster than they improve.',
-        within=(1, 100),
-    )
     publish_clock: bool = setting(
         False,
         'Publish the stamps of a recording as /clock, for nodes with use_sim_time; no other node '

@@ -21,7 +21,7 @@ class OccupancyGridNodeSettings(OccupancyGridSettings, NodeSettings):
     )
     map_file: str = setting(
         'map.yaml',
-        'File that the service save_map writes, with the image beside it; .yaml is appended where '
-        'it lacks.',
+        'File that the service save_map writes, with the image next to it; .yaml is appended if '
+        'missing.',
         live=True,
     )

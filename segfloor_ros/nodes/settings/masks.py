@@ -13,5 +13,5 @@ class SegfloorMasksNodeSettings(RobotSettings, NodeSettings):
     """Which network looks at the images, and what concerns the robot."""
 
     network: str = setting(
-        '', 'Segmentation network, FILE.onnx with FILE.yaml beside it, which says how it is used.'
+        '', 'Segmentation network, FILE.onnx; FILE.yaml next to it describes it.'
     )

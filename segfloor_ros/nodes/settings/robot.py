@@ -26,14 +26,14 @@ class SimulatedRobotNodeSettings(NodeSettings):
     rate: float = setting(
         1.0,
         'Speed of its time against real time, less where the rendering takes longer; 0: in step '
-        'with who drives it, each frame once a command with the stamp of the one before has come.',
+        'with the driving node, one frame per command with the stamp of the last frame.',
         within=(0.0, 100.0),
     )
     stamped_commands: bool = setting(
-        True, 'Take cmd_vel as TwistStamped, as in step with who drives it is needed; off: Twist.'
+        True, 'Take cmd_vel as TwistStamped, which driving in step needs; off: Twist.'
     )
     command_timeout_s: float = setting(
-        0.5, 'The robot stops when no command has come for so long.', within=(0.05, 60.0)
+        0.5, 'The robot stops without a command for this time.', within=(0.05, 60.0)
     )
     start_paused: bool = setting(False, 'Wait for the service ~/pause before the first frame.')
     left_frame: str = setting('left_camera_optical_frame', 'Optical frame of the left camera.')

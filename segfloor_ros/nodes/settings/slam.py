@@ -33,7 +33,7 @@ class StereoSlamNodeSettings(StereoSlamSettings, NodeSettings):
     )
     load_map: str = setting(
         '',
-        'Saved map to go on with, at the start, at a reset and by ~/load_map; empty: an empty map.',
+        'Saved map to continue, at the start, at a reset and by ~/load_map; empty: an empty map.',
         live=True,
     )
     localize: bool = setting(
@@ -46,15 +46,15 @@ class StereoSlamNodeSettings(StereoSlamSettings, NodeSettings):
     )
     resume_within_s: float = setting(
         30.0,
-        'The map goes on where a node that was killed is started again within this time; 0: with '
-        'an empty map. The nodes behind take what they knew from this one.',
+        'A node that is killed and restarted within this time continues its map; 0: it begins an '
+        'empty one.',
         within=(0.0, 3600.0),
     )
     save_map: str = setting('', 'File that ~/save_map writes the whole map to.', live=True)
     background: bool = setting(
         True,
-        'Adjust the map beside tracking, so that no frame waits for it; off: results do not '
-        'depend on timing.',
+        'Adjust the map in parallel to tracking, so that no frame waits for it; off: results do '
+        'not depend on timing.',
     )
     image_kind: str = setting(
         'auto',
@@ -86,8 +86,8 @@ class StereoSlamNodeSettings(StereoSlamSettings, NodeSettings):
     )
     mask_timeout_s: float = setting(
         0.2,
-        'A mask on dynamic_mask is used for later frames, too, until it is so old or a newer one '
-        'comes; 0: only for the frame of its stamp.',
+        'A mask on dynamic_mask also serves later frames until it is this old or a newer one '
+        'comes; 0: only the frame of its stamp.',
         within=(0.0, 10.0),
     )
     max_waiting_frames: int = setting(
@@ -97,12 +97,6 @@ class StereoSlamNodeSettings(StereoSlamSettings, NodeSettings):
         'keyframe. A lossless stereo_camera sends no more at a time.',
         within=(3, 100),
         live=True,
-    )
-    bit_depth: int = setting(
-        0,
-        'Bits used in the pixels of 16-bit images; 0 takes it from the brightest so far.',
-        unit='bits',
-        within=(0, 16),
     )
 
     @property

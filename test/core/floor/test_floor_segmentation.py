@@ -306,15 +306,6 @@ def test_the_border_that_rectification_leaves_is_no_floor():
     assert np.mean(mask[inside] == FLOOR) > 0.97
 
 
-@pytest.mark.parametrize(('whole', 'expected'), [(True, 1.0), (False, 0.0)])
-def test_the_rows_above_the_horizon_are_matched_where_asked_for(whole, expected):
-    left, right, _, depth = Scene([floor_patch(), wall(2.0)], SMALL_CAMERA).render()
-    settings = FloorSegmentationSettings(disparity_above_horizon=whole)
-    found = FloorSegmentation(SMALL_CAMERA, settings).process(left, right, MOUNT).disparity_px
-    above, true = found[:60, 20:-20], SMALL_CAMERA.disparity_times_depth / depth[:60, 20:-20]
-    assert np.mean(np.abs(above - true) < 0.5) == pytest.approx(expected, abs=0.05)
-
-
 def test_same_input_same_output():
     scene = Scene([floor_patch(), wall(), *box(1.5, 0.3, 0.3, 0.2)])
     first, _, _ = segment(scene, (np.eye(4), np.eye(4)))

@@ -9,6 +9,7 @@ from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.core.plugins.assembly import make_slam
 from segfloor_ros.core.slam.settings import StereoSlamSettings
+from segfloor_ros.core.slam.tracking.images import MASK_DILATION_PX
 
 BORDER_PX = 40
 
@@ -32,6 +33,6 @@ def test_the_black_border_of_rectification_does_not_move(is_masked) -> None:
             continue
         moving = keyframe.moving
         assert (moving[mask > 0] == 255).all()
-        around = settings.mask_dilation_px + 1
+        around = MASK_DILATION_PX + 1
         moving[100 - around : 140 + around, 200 - around : 240 + around] = 0
         assert not moving.any()

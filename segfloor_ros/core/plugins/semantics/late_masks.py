@@ -14,8 +14,8 @@ from segfloor_ros.core.slam.tracking.images import dilate, is_inside
 class LateMasks(NoLateMasks):
     """Takes back the points of keyframes where masks that come later show what moves."""
 
-    def __init__(self, front_end: FrontEnd, sparse_map: SparseMap, dilation_px: int) -> None:
-        self._front_end, self._map, self._dilation_px = front_end, sparse_map, dilation_px
+    def __init__(self, front_end: FrontEnd, sparse_map: SparseMap) -> None:
+        self._front_end, self._map = front_end, sparse_map
         self._masks: list[tuple[KeyframeRecord, Region]] = []
 
     def add(self, stamp_ns: int, mask: Region) -> None:
@@ -25,7 +25,7 @@ class LateMasks(NoLateMasks):
         recent = self._map.keyframes[-LOCAL_KEYFRAMES:]  # others hardly change any more
         keyframe = next((k for k in recent if k.stamp_ns == stamp_ns), None)
         if keyframe is not None and not self._front_end.is_fixed:
-            self._masks.append((keyframe, dilate(mask, self._dilation_px)))
+            self._masks.append((keyframe, dilate(mask)))
 
     def take_points_back(self) -> None:
         """Remove the points; while nothing is being adjusted."""

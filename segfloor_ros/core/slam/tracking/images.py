@@ -73,6 +73,9 @@ and one in a billion pairs is as near as this by chance."""
 MAX_RATIO = 0.85
 """A match must be so much nearer than the second best (Lowe, Distinctive Image Features, 2004)."""
 
+MASK_DILATION_PX = 5
+"""Masks of moving things are widened by this much: networks cut corners."""
+
 NEIGHBOURS = 12
 """Features looked at around a predicted pixel; a radius holds about ten."""
 
@@ -95,19 +98,12 @@ class Images:
     moving: Region | None = None
 
     @staticmethod
-    def of(
-        frame: StereoFrame,
-        camera: StereoCamera,
-        border: Region | None = None,
-        mask_dilation_px: int = 0,
-    ) -> Images:
-        """Prepare the images of a frame. border: that rectification leaves in the left one.
-        mask_dilation_px: of the mask that came with it.
-        """
+    def of(frame: StereoFrame, camera: StereoCamera, border: Region | None = None) -> Images:
+        """Prepare the images of a frame. border: that rectification leaves in the left one."""
         depth_scale = camera.disparity_times_depth if is_disparity(frame.right) else 0.0
         left, right = frame.left.astype(np.float32), frame.right.astype(np.float32)
         said = frame.excluded
-        moving = None if said is None else dilate(said, mask_dilation_px)
+        moving = None if said is None else dilate(said)
         return Images(left, right, shrink(frame.left), union(border, moving), depth_scale, moving)
 
 
@@ -154,10 +150,8 @@ def follow_pixels(
     return uv, np.asarray(status).ravel() > 0
 
 
-def dilate(region: Region, radius_px: int) -> Region:
+def dilate(region: Region, radius_px: int = MASK_DILATION_PX) -> Region:
     """Return the region and everything within a radius of it."""
-    if radius_px == 0:
-        return region
     size = 2 * radius_px + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     return np.asarray(cv2.dilate(region, disc), np.uint8)
