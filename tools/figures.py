@@ -34,6 +34,7 @@ from segfloor_ros.core.files.whole import read_json
 from segfloor_ros.core.geometry import Array
 from tools.published_figures import Row, page_table
 from tools.published_paths import PathRow, paths_table
+from tools.published_peers import SlamRow, slam_table
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / 'docs' / 'figures.json'
@@ -134,6 +135,7 @@ def written(page: str) -> str:
         'drives': _long_table,
         'published': _published_table,
         'paths': _paths_table,
+        'slam': _slam_table,
     }
     for mark, table in tables.items():
         start, end = f'<!-- {mark}: python -m tools.figures write -->\n', f'<!-- end of {mark} -->'
@@ -245,15 +247,17 @@ def _long_table(figures: dict[str, Any]) -> str:
 
 def _published_table(figures: dict[str, Any]) -> str:
     """Return the figures of docs/published.json; the others are not needed."""
-    found = read_json(PUBLISHED_FIGURES, 'figures')
-    rows = [Row(**row) for row in found['rows']]
-    return f'{page_table(rows)}\nMeasured here: {found["about"]}.\n'
+    return page_table([Row(**row) for row in read_json(PUBLISHED_FIGURES, 'figures')['rows']])
 
 
 def _paths_table(figures: dict[str, Any]) -> str:
     """Return the paths of docs/published.json; the other figures are not needed."""
-    found = read_json(PUBLISHED_FIGURES, 'figures')
-    return paths_table([PathRow(**row) for row in found['paths']])
+    return paths_table([PathRow(**row) for row in read_json(PUBLISHED_FIGURES, 'figures')['paths']])
+
+
+def _slam_table(figures: dict[str, Any]) -> str:
+    """Return the paths alone of docs/published.json; the other figures are not needed."""
+    return slam_table([SlamRow(**row) for row in read_json(PUBLISHED_FIGURES, 'figures')['slam']])
 
 
 def _tracked(found: dict[str, float]) -> str:
