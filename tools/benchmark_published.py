@@ -80,7 +80,6 @@ from tools.published_figures import (
     parse_scenes,
 )
 from tools.published_paths import PathRow
-from tools.published_peers import HEADS as SLAM_HEADS
 from tools.published_peers import SlamRow, run_peers, run_program, slam_cells
 
 SCENES = (*PUBLISHED, *published_paths.DRIVES)
@@ -372,8 +371,9 @@ def path_table(rows: Sequence[PathRow]) -> Table:
 
 def slam_rich(rows: Sequence[SlamRow]) -> Table:
     """Return the paths of other programs beside ours, drive by drive."""
-    table = figure_table(*SLAM_HEADS)
-    for cells in slam_cells(rows):
+    heads, *lines = slam_cells(rows)
+    table = figure_table(*heads)
+    for cells in lines:
         table.add_row(*cells)
     return table
 
@@ -422,8 +422,9 @@ def benchmark_published(
                 result = run_scene(name, scene, folder, configuration, threads, announce, system)
                 results.append(result)
                 rows.append(result.row)
-            if peers is not None:
+            if peers is not None and (peers / 'bin' / 'rtabgrid').is_file():
                 rows.append(run_rtabmap(peers / 'bin' / 'rtabgrid', name, folder, announce))
+            if peers is not None:
                 slam += run_peers(name, folder / 'recording', peers, folder / 'paths', announce)
         for recording in recordings or ():
             if peers is not None:

@@ -221,28 +221,27 @@ def _demo(work: Path) -> dict[str, float]:
 def _short_table(figures: dict[str, Any]) -> str:
     rows = [(drive.label, figures['drives'][name]) for name, drive in DRIVES.items() if drive.label]
     rows.append(('the demo through the five nodes', figures['demo']))
-    heads = ('recording', 'frames tracked', 'path error', 'free cells, precision / recall')
+    heads = ('recording', 'frames tracked', 'path error', 'free cells, precision / recall, %')
     return _table(heads, [(a, _tracked(f), _path(f), _pair(f, 'free')) for a, f in rows])
 
 
 def _long_table(figures: dict[str, Any]) -> str:
-    heads = ('recording', 'what', 'frames, length', 'tracked', 'path error',
-             'road map, precision / recall', 'free cells', 'floor masks; false floor',
-             'frames with something that moves', 'time')  # fmt: skip
-    rows = []
+    heads = ('recording', 'frames, metres, seconds', 'path error, m', 'road map, %',
+             'free cells, %', 'floor masks; false floor, %')  # fmt: skip
+    rows, bare = [], []
     for name, drive in DRIVES.items():
         found = figures['drives'][name]
         masks = _pair(found, 'floor')
         if 'false_floor_percent' in found:
-            masks += f'; {found["false_floor_percent"]:.1f} %'
-        rows.append(
-            (
-                name, drive.about, f'{found["frames"]:.0f}, {found["length_m"]:.1f} m',
-                _tracked(found), _path(found), _pair(found, ''), _pair(found, 'free'), masks,
-                f'{found["moving_frames"]:.0f}', f'{found["wall_s"]:.0f} s',
-            )
-        )  # fmt: skip
-    return _table(heads, rows)
+            masks += f'; {found["false_floor_percent"]:.1f}'
+        path = _path(found).removesuffix(' m')
+        row = (f'{name}: {drive.about}', _frames(found), path, _pair(found, ''),
+               _pair(found, 'free'), masks)  # fmt: skip
+        if {*row[2:]} == {'–'}:
+            bare.append(f'{row[0]} ({row[1]})')
+        else:
+            rows.append(row)
+    return _table(heads, rows) + f'\nWithout truth: {"; ".join(bare)}.\n'
 
 
 def _published_table(figures: dict[str, Any]) -> str:
@@ -258,6 +257,16 @@ def _paths_table(figures: dict[str, Any]) -> str:
 def _slam_table(figures: dict[str, Any]) -> str:
     """Return the paths alone of docs/published.json; the other figures are not needed."""
     return slam_table([SlamRow(**row) for row in read_json(PUBLISHED_FIGURES, 'figures')['slam']])
+
+
+def _frames(found: dict[str, float]) -> str:
+    """Return what stands in the table of a drive, and what not all drives have."""
+    words = [f'{found["frames"]:.0f}', f'{found["length_m"]:.1f}', f'{found["wall_s"]:.0f}']
+    if found['tracked_percent'] < 100:
+        words.append(f'{_tracked(found)} tracked')
+    if found['moving_frames']:
+        words.append(f'{found["moving_frames"]:.0f} moving')
+    return ', '.join(words)
 
 
 def _tracked(found: dict[str, float]) -> str:
@@ -276,7 +285,7 @@ def _pair(found: dict[str, float], kind: str) -> str:
     names = [f'{kind}_{part}_percent'.lstrip('_') for part in ('precision', 'recall')]
     if any(name not in found for name in names):
         return '–'
-    return ' / '.join(f'{found[name]:.1f}' for name in names) + ' %'
+    return '/'.join(f'{found[name]:.1f}' for name in names)
 
 
 def _table(heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:

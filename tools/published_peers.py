@@ -1,9 +1,9 @@
 """The path alone, ours beside that of programs built from their published sources: RTAB-Map,
-stella_vslam and ORB-SLAM2, each on a rectified recording in the layout of KITTI.
+stella_vslam, ORB-SLAM2 and ORB-SLAM3, each on a rectified recording in the layout of KITTI.
 
-A folder has their runners: `bin/rtabgrid slam DIR`, `bin/stella_kitti VOCABULARY DIR` and
-`bin/orb_kitti VOCABULARY DIR`, each with `--out PATH.txt` (TUM), and the vocabularies
-`vocab/orb.fbow` and `vocab/orb.txt`.
+A folder has runners for some of them: `bin/rtabgrid slam DIR`, `bin/stella_kitti VOCABULARY DIR`,
+`bin/orb_kitti VOCABULARY DIR` and `bin/orb3_kitti VOCABULARY DIR`, each with `--out PATH.txt`
+(TUM), and their vocabularies in `vocab`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ RUNNERS = {
     'stella_vslam': ('stella_kitti', 'vocab/orb.fbow'),
     'stella_vslam, no loops': ('stella_kitti', 'none'),
     'ORB-SLAM2': ('orb_kitti', 'vocab/orb.txt'),
+    'ORB-SLAM3': ('orb3_kitti', 'vocab/orb3.txt'),
 }
 """Program and first word, by system."""
 
@@ -48,14 +49,17 @@ class SlamRow:
 def run_peers(
     drive: str, recording: Path, peers: Path, out: Path, announce: Announce
 ) -> list[SlamRow]:
-    """Return the rows of all systems on a recording with a true path, run one after the other."""
+    """Return the rows of ours and of all systems that have a runner, on a recording with a true
+    path, run one after the other.
+    """
     out.mkdir(parents=True, exist_ok=True)
     commands: dict[str, list[str | Path]] = {
         OURS: [sys.executable, '-m', 'segfloor_ros.apps.cli.main', 'run', recording, '--no-map']
     }
     for system, (program, first) in RUNNERS.items():
-        word = peers / first if '/' in first else first
-        commands[system] = [peers / 'bin' / program, word, recording]
+        runner, word = peers / 'bin' / program, peers / first if '/' in first else first
+        if runner.is_file():
+            commands[system] = [runner, word, recording]
     rows = []
     for number, (system, command) in enumerate(commands.items()):
         announce(f'{system} on {drive}', 0)
@@ -87,15 +91,15 @@ def run_program(words: Sequence[str | Path | float]) -> tuple[str, float, float]
     return said, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024
 
 
-HEADS = ('drive', OURS, *RUNNERS)
-
-
 def slam_cells(rows: Sequence[SlamRow]) -> list[tuple[str, ...]]:
-    """Return a line for each drive, with a cell for each of `HEADS`."""
-    lines = []
+    """Return a head, then a line for each drive: a cell for each system that was run, with the path
+    error in mm, the CPU time in seconds, the memory in MB, and what share was tracked, if not all.
+    """
+    systems = [name for name in (OURS, *RUNNERS) if any(row.system == name for row in rows)]
+    lines = [('drive', *systems)]
     for drive in dict.fromkeys(row.drive for row in rows):
         own = {row.system: row for row in rows if row.drive == drive}
-        lines.append((drive, *(_cell(own.get(system)) for system in HEADS[1:])))
+        lines.append((drive, *(_cell(own.get(system)) for system in systems)))
     return lines
 
 
@@ -105,11 +109,12 @@ def _cell(row: SlamRow | None) -> str:
     if row.path_error_m is None or row.tracked_percent is None:
         return 'failed'
     tracked = '' if row.tracked_percent >= 99.95 else f'{row.tracked_percent:.1f} % tracked, '
-    return f'{tracked}{1000 * row.path_error_m:.3g} mm, {row.cpu_s:.0f} s, {row.peak_mb:.0f} MB'
+    return f'{tracked}{1000 * row.path_error_m:.1f}, {row.cpu_s:.0f}, {row.peak_mb:.0f}'
 
 
 def slam_table(rows: Sequence[SlamRow]) -> str:
     """Return the lines as a table of Markdown, with when and at which commit they were measured."""
-    lines = [HEADS, ('---',) * len(HEADS), *slam_cells(rows)]
+    lines = slam_cells(rows)
+    lines.insert(1, ('---',) * len(lines[0]))
     table = ''.join('| ' + ' | '.join(line) + ' |\n' for line in lines)
     return f'{table}\nMeasured: {"; ".join(dict.fromkeys(row.source for row in rows))}.\n'

@@ -84,16 +84,17 @@ def test_rows_are_kept_by_scene_and_system(tmp_path, monkeypatch):
     ]  # fmt: skip
     assert rows[0].precision_percent == 99.0
     paths = paths_table([PathRow(**row) for row in document['paths']])
-    assert '| Husky 01, S | 53.54 m | 56.81 m | 55.67 m |' in paths
-    assert '| KITTI 00 | 3662.13 m | 3083.56 m | 3290.67 m |' in paths
-    assert '| 51.00 m | 50.00 m, 0.100 m off, 90 % tracked |  |' in paths
+    assert '| Husky 01, S | 53.54 | 56.81 | 55.67 |' in paths
+    assert '| KITTI 00 | 3662.13 | 3083.56 | 3290.67 |' in paths
+    assert '| 51.00 | 50.00, 0.100 off, 90 % tracked |  |' in paths
     assert all(line.count('|') == len(PAGE_HEADS) + 1 for line in paths.splitlines())
     slam = slam_table([SlamRow(**row) for row in document['slam']])
-    assert '| corridor1 |  | 98.8 % tracked, 12.3 mm, 10 s, 123 MB |  |  | failed |' in slam
+    assert '| drive | RTAB-Map | ORB-SLAM2 |' in slam
+    assert '| corridor1 | 98.8 % tracked, 12.3, 10, 123 | failed |' in slam
     assert slam.endswith('Measured: again.\n')
     page = page_table(rows)
     lines = [line.strip('| ').split(' | ') for line in page.splitlines()]
-    assert lines[2][0] == 'corridor1: a' and lines[2][2] == '99.0 %'
+    assert lines[2][0] == 'corridor1: a' and lines[2][2] == '99.0'
     assert all(line.count('|') == len(HEADS) + 1 for line in page.splitlines())
 
 
@@ -163,7 +164,7 @@ def test_other_programs_estimate_the_same_path(tmp_path):
     stella.chmod(0o755)
     found = run_peers('room', recording, tmp_path, tmp_path / 'paths', lambda what, total: None)
     rows = {row.system: row for row in found}
-    assert list(rows) == ['segfloor_ros', *RUNNERS]
+    assert list(rows) == ['segfloor_ros', *list(RUNNERS)[:-1]]  # the last has no runner here
     for name in ('RTAB-Map', 'ORB-SLAM2'):
         assert rows[name].path_error_m == pytest.approx(0.0, abs=1e-6)
     for row in (rows['segfloor_ros'], rows['RTAB-Map']):
@@ -224,7 +225,7 @@ def test_a_scene_is_rendered_once_mapped_and_scored(tmp_path):
     assert '…' not in text
     row = next(line for line in text.split('\n') if ' Segfloor ' in line)
     cells = [cell.strip() for cell in row.split('│')]
-    assert cells[2:6] == ['1 cm, 220', '99.6 %', '– / 97.2 %', '– / 0.38 s']
+    assert cells[2:5] == ['1; 220', '99.6; –/97.2', '–/0.38']
     document = json.loads(json.dumps(as_document([first], [first.row])))
     assert document['rows'][0]['scene'] == 'corridor2'
     assert document['published'][0]['system'] == 'Segfloor'
