@@ -1,8 +1,8 @@
 """The scenes of the published evaluation, rendered, mapped and scored here, beside the published
 figures: `python -m tools.benchmark_published`.
 
-Each is mapped by default, and as published: by the same drive. `--rtabmap rtabgrid` also runs a
-runner of RTAB-Map over it, `rtabgrid slam DIR --out PATH.txt` and `rtabgrid grid DIR --out MAP …`.
+Each is mapped by default, and as published: by the same drive. `--peers FOLDER` also runs other
+programs over it (`published_peers`), and maps it by `rtabgrid grid DIR --out MAP …`, RTAB-Map.
 The drives of the second published work are compared by their paths (`published_paths`).
 
 `--keep` writes docs/published.json, from which `python -m tools.figures write` makes the table of
@@ -80,9 +80,12 @@ from tools.published_figures import (
     parse_scenes,
 )
 from tools.published_paths import PathRow
+from tools.published_peers import SlamRow, run_peers, run_program, slam_cells
 
 SCENES = (*PUBLISHED, *published_paths.DRIVES)
 KEPT = Path(__file__).resolve().parents[1] / 'docs' / 'published.json'
+KINDS = (('rows', Row, 'scene'), ('paths', PathRow, 'drive'), ('slam', SlamRow, 'drive'))
+"""What is kept there: the name and the type of rows, and what they are of."""
 
 DEFAULT, AS_PUBLISHED = 'segfloor_ros', 'segfloor_ros, as published'
 MODES: dict[str, tuple[str, ...]] = {
@@ -258,14 +261,14 @@ def run_rtabmap(program: Path, name: str, folder: Path, announce: Announce) -> R
     """Return the row of RTAB-Map on a scene that is rendered: with its own path, one update of the
     map a second, ray tracing, rays as long as published. Raises SegfloorError where it fails.
 
-    Without ray tracing the runner's maps have next to no floor, by its normals as well as by its
-    height; that is not measured, as it may be the runner's fault.
+    Without ray tracing its maps of the corridors have next to no floor, as its block matching finds
+    a disparity in 3 % of the floor's pixels; that is not measured.
     """
     recording, truth = folder / 'recording', load_truth(folder / 'recording')
     facts = read_yaml(recording / 'scene.yaml', 'names and values')
     announce(f'RTAB-Map on {name}', 0)
     path, stem = folder / 'rtabmap.txt', folder / 'rtabmap'
-    said, cpu_s, peak_mb = _run([program, 'slam', recording, '--out', path])
+    said, cpu_s, peak_mb = run_program([program, 'slam', recording, '--out', path])
     nodes = int(_figure(said, 'slam_nodes'))
     words: list[str | Path | float] = [program, 'grid', recording, '--out', stem, '--tum', path]
     words += ['--step', round(float(facts['rate_hz'])), '--height', facts['camera_height_m']]
@@ -273,7 +276,7 @@ def run_rtabmap(program: Path, name: str, folder: Path, announce: Announce) -> R
     words += ['--param', f'Grid/CellSize={RTABMAP_CELL_M}', '--param', 'Grid/RayTracing=true']
     if PUBLISHED[name].range_m:
         words += ['--param', f'Grid/RangeMax={PUBLISHED[name].range_m:g}']
-    said, _, _ = _run(words)
+    said, _, _ = run_program(words)
     grid = load_map(stem.with_suffix('.yaml'))
     row, _, _ = scored_row(grid, truth, name, RAYS, folder / 'rtabmap_scored')
     return dataclasses.replace(
@@ -286,20 +289,6 @@ def run_rtabmap(program: Path, name: str, folder: Path, announce: Announce) -> R
     )
 
 
-def _run(words: Sequence[str | Path | float]) -> tuple[str, float, float]:
-    """Return what a program said, its CPU time in seconds and its peak memory in MB."""
-    with subprocess.Popen(
-        [str(word) for word in words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as process:
-        assert process.stdout is not None
-        said = process.stdout.read()
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise SegfloorError(f'{words[0]} {words[1]}: status {process.returncode}: {said[-300:]}')
-    return said, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024
-
-
 def _figure(said: str, name: str) -> float:
     found = re.search(rf'\b{name} ([-\d.]+)', said)
     if found is None:
@@ -308,7 +297,10 @@ def _figure(said: str, name: str) -> float:
 
 
 def as_document(
-    results: Sequence[SceneResult], rows: Sequence[Row], paths: Sequence[PathRow] = ()
+    results: Sequence[SceneResult],
+    rows: Sequence[Row],
+    paths: Sequence[PathRow] = (),
+    slam: Sequence[SlamRow] = (),
 ) -> dict[str, Any]:
     """Return the figures of all scenes as plain numbers for a JSON file."""
     return {
@@ -322,28 +314,34 @@ def as_document(
             dataclasses.asdict(row) for scene in PUBLISHED.values() for row in scene.rows
         ],
         'paths': [dataclasses.asdict(row) for row in paths],
+        'slam': [dataclasses.asdict(row) for row in slam],
         'workloads': [dataclasses.asdict(result.workload) for result in results],
     }
 
 
-def keep(rows: Sequence[Row], paths: Sequence[PathRow], about: str) -> None:
-    """Put rows into docs/published.json, in place of those of the same scenes and systems. about:
-    where and when they were measured.
+def keep(*rows: Row | PathRow | SlamRow, source: str) -> None:
+    """Put rows into docs/published.json, in place of those of the same scenes and systems. source:
+    when and from which state of the code they were measured.
     """
-    kept = read_json(KEPT, 'figures') if KEPT.is_file() else {'rows': [], 'paths': []}
-    document: dict[str, Any] = {'about': about}
-    for kind, keys, new in (
-        ('rows', ('scene', 'system'), rows),
-        ('paths', ('drive', 'system'), paths),
-    ):
-        found = [*kept[kind], *map(_rounded, new)]
-        document[kind] = [*{tuple(one[key] for key in keys): one for one in found}.values()]
+    kept = read_json(KEPT, 'figures') if KEPT.is_file() else {}
+    document: dict[str, Any] = {}
+    for kind, of, place in KINDS:
+        new = [_rounded(row) | {'source': source} for row in rows if isinstance(row, of)]
+        found = [*kept.get(kind, []), *new]
+        document[kind] = [*{(one[place], one['system']): one for one in found}.values()]
     KEPT.write_text(json.dumps(document, indent=1) + '\n', encoding='utf-8')
 
 
-def _rounded(row: Row | PathRow) -> dict[str, Any]:
+def _rounded(row: Row | PathRow | SlamRow) -> dict[str, Any]:
     values: dict[str, Any] = dataclasses.asdict(row)
     return {k: round(v, 4) if isinstance(v, float) else v for k, v in values.items()}
+
+
+def today_and_commit() -> str:
+    """Return the date and the commit of the code, by which kept figures name their source."""
+    command = ['git', '-C', str(KEPT.parent), 'rev-parse', '--short', 'HEAD']
+    commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+    return f'{datetime.date.today().isoformat()}, {commit or __version__}'
 
 
 def published_table(rows: Sequence[Row]) -> Table:
@@ -371,6 +369,15 @@ def path_table(rows: Sequence[PathRow]) -> Table:
     return table
 
 
+def slam_rich(rows: Sequence[SlamRow]) -> Table:
+    """Return the paths of other programs beside ours, drive by drive."""
+    heads, *lines = slam_cells(rows)
+    table = figure_table(*heads)
+    for cells in lines:
+        table.add_row(*cells)
+    return table
+
+
 def benchmark_published(
     scenes: Annotated[
         str, typer.Option(help='Which of the published scenes and drives.')
@@ -379,9 +386,13 @@ def benchmark_published(
         Optional[Path],  # noqa: UP045  typer evaluates it, also on Python 3.10
         typer.Option(help='Keep renderings, maps and overlays here; what is there is used again.'),
     ] = None,
-    rtabmap: Annotated[
+    peers: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(metavar='RTABGRID', help='Runner of RTAB-Map, to map the same drives.'),
+        typer.Option(help='Folder of runners of other programs, to run over the same scenes.'),
+    ] = None,
+    recordings: Annotated[
+        Optional[list[Path]],  # noqa: UP045
+        typer.Option('--recording', help='Compare paths with the others here too; repeatable.'),
     ] = None,
     is_kept: Annotated[
         bool, typer.Option('--keep', help='Write docs/published.json, for docs/benchmarks.md.')
@@ -394,8 +405,9 @@ def benchmark_published(
     assignments: options.Set = None,
 ) -> None:
     """Simulate, map and score the scenes of the published evaluation."""
-    names, rows, paths = parse_scenes(scenes, SCENES), [], []
+    names, rows, paths, slam = parse_scenes(scenes, SCENES), [], [], []
     results: list[SceneResult] = []
+    source = today_and_commit()
     with tempfile.TemporaryDirectory(prefix='segfloor-') as temporary, announcing() as announce:
         base = workdir or Path(temporary)
         for name in (name for name in names if name in published_paths.DRIVES):
@@ -410,22 +422,28 @@ def benchmark_published(
                 result = run_scene(name, scene, folder, configuration, threads, announce, system)
                 results.append(result)
                 rows.append(result.row)
-            if rtabmap is not None:
-                rows.append(run_rtabmap(rtabmap, name, folder, announce))
+            if peers is not None and (peers / 'bin' / 'rtabgrid').is_file():
+                rows.append(run_rtabmap(peers / 'bin' / 'rtabgrid', name, folder, announce))
+            if peers is not None:
+                slam += run_peers(name, folder / 'recording', peers, folder / 'paths', announce)
+        for recording in recordings or ():
+            if peers is not None:
+                out = base / recording.name / 'paths'
+                slam += run_peers(recording.name, recording, peers, out, announce)
+        if is_kept:
+            keep(*rows, *paths, *slam, source=source)
     if rows:
         console.print(stage_table([result.workload for result in results]))
         console.print(workload_table([result.workload for result in results]))
         console.print(published_table(rows))
     if paths:
         console.print(path_table(paths))
+    if slam:
+        console.print(slam_rich(slam))
     if workdir is not None:
         console.print(f'maps on the truth: {workdir}/*/*_overlay.png', highlight=False)
-    if is_kept:
-        here = machine()
-        today = datetime.date.today().isoformat()
-        keep(rows, paths, f'{today}, {here["processor"]}, Python {here["python"]}')
     if as_json:
-        options.print_json(as_document(results, rows, paths))
+        options.print_json(as_document(results, rows, paths, slam))
 
 
 if __name__ == '__main__':

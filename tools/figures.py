@@ -34,6 +34,7 @@ from segfloor_ros.core.files.whole import read_json
 from segfloor_ros.core.geometry import Array
 from tools.published_figures import Row, page_table
 from tools.published_paths import PathRow, paths_table
+from tools.published_peers import SlamRow, slam_table
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / 'docs' / 'figures.json'
@@ -134,6 +135,7 @@ def written(page: str) -> str:
         'drives': _long_table,
         'published': _published_table,
         'paths': _paths_table,
+        'slam': _slam_table,
     }
     for mark, table in tables.items():
         start, end = f'<!-- {mark}: python -m tools.figures write -->\n', f'<!-- end of {mark} -->'
@@ -219,41 +221,52 @@ def _demo(work: Path) -> dict[str, float]:
 def _short_table(figures: dict[str, Any]) -> str:
     rows = [(drive.label, figures['drives'][name]) for name, drive in DRIVES.items() if drive.label]
     rows.append(('the demo through the five nodes', figures['demo']))
-    heads = ('recording', 'frames tracked', 'path error', 'free cells, precision / recall')
+    heads = ('recording', 'frames tracked', 'path error', 'free cells, precision / recall, %')
     return _table(heads, [(a, _tracked(f), _path(f), _pair(f, 'free')) for a, f in rows])
 
 
 def _long_table(figures: dict[str, Any]) -> str:
-    heads = ('recording', 'what', 'frames, length', 'tracked', 'path error',
-             'road map, precision / recall', 'free cells', 'floor masks; false floor',
-             'frames with something that moves', 'time')  # fmt: skip
-    rows = []
+    heads = ('recording', 'frames, metres, seconds', 'path error, m', 'road map, %',
+             'free cells, %', 'floor masks; false floor, %')  # fmt: skip
+    rows, bare = [], []
     for name, drive in DRIVES.items():
         found = figures['drives'][name]
         masks = _pair(found, 'floor')
         if 'false_floor_percent' in found:
-            masks += f'; {found["false_floor_percent"]:.1f} %'
-        rows.append(
-            (
-                name, drive.about, f'{found["frames"]:.0f}, {found["length_m"]:.1f} m',
-                _tracked(found), _path(found), _pair(found, ''), _pair(found, 'free'), masks,
-                f'{found["moving_frames"]:.0f}', f'{found["wall_s"]:.0f} s',
-            )
-        )  # fmt: skip
-    return _table(heads, rows)
+            masks += f'; {found["false_floor_percent"]:.1f}'
+        path = _path(found).removesuffix(' m')
+        row = (f'{name}: {drive.about}', _frames(found), path, _pair(found, ''),
+               _pair(found, 'free'), masks)  # fmt: skip
+        if {*row[2:]} == {'–'}:
+            bare.append(f'{row[0]} ({row[1]})')
+        else:
+            rows.append(row)
+    return _table(heads, rows) + f'\nWithout truth: {"; ".join(bare)}.\n'
 
 
 def _published_table(figures: dict[str, Any]) -> str:
     """Return the figures of docs/published.json; the others are not needed."""
-    found = read_json(PUBLISHED_FIGURES, 'figures')
-    rows = [Row(**row) for row in found['rows']]
-    return f'{page_table(rows)}\nMeasured here: {found["about"]}.\n'
+    return page_table([Row(**row) for row in read_json(PUBLISHED_FIGURES, 'figures')['rows']])
 
 
 def _paths_table(figures: dict[str, Any]) -> str:
     """Return the paths of docs/published.json; the other figures are not needed."""
-    found = read_json(PUBLISHED_FIGURES, 'figures')
-    return paths_table([PathRow(**row) for row in found['paths']])
+    return paths_table([PathRow(**row) for row in read_json(PUBLISHED_FIGURES, 'figures')['paths']])
+
+
+def _slam_table(figures: dict[str, Any]) -> str:
+    """Return the paths alone of docs/published.json; the other figures are not needed."""
+    return slam_table([SlamRow(**row) for row in read_json(PUBLISHED_FIGURES, 'figures')['slam']])
+
+
+def _frames(found: dict[str, float]) -> str:
+    """Return what stands in the table of a drive, and what not all drives have."""
+    words = [f'{found["frames"]:.0f}', f'{found["length_m"]:.1f}', f'{found["wall_s"]:.0f}']
+    if found['tracked_percent'] < 100:
+        words.append(f'{_tracked(found)} tracked')
+    if found['moving_frames']:
+        words.append(f'{found["moving_frames"]:.0f} moving')
+    return ', '.join(words)
 
 
 def _tracked(found: dict[str, float]) -> str:
@@ -272,7 +285,7 @@ def _pair(found: dict[str, float], kind: str) -> str:
     names = [f'{kind}_{part}_percent'.lstrip('_') for part in ('precision', 'recall')]
     if any(name not in found for name in names):
         return '–'
-    return ' / '.join(f'{found[name]:.1f}' for name in names) + ' %'
+    return '/'.join(f'{found[name]:.1f}' for name in names)
 
 
 def _table(heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:

@@ -142,52 +142,59 @@ def parse_scenes(text: str, known: Sequence[str]) -> list[str]:
 
 
 HEADS = (
-    'scene: system', 'cell, keyframes', 'precision', 'recall: in view / all',
-    'update: mean / longest, growth', 'path error, CPU, memory', 'source',
+    'scene: system', 'cell, cm; keyframes', 'precision; recall, %', 'update, s; growth, MB',
+    'path error, mm; CPU, s; memory, MB', 'source',
 )  # fmt: skip
 
 
 def cells_of(row: Row) -> tuple[str, ...]:
-    """Return a row in words, one cell for each of `HEADS` but the first."""
-    costs = (
-        _text(row.path_error_m and 1000 * row.path_error_m, '{:.1f} mm'),
-        _text(row.cpu_s, '{:.0f} s'),
-        _text(row.peak_mb, '{:.0f} MB'),
-    )
-    update = _pair(row.update_s, row.update_max_s, '{:.2f}', ' s')
+    """Return a row in words, one cell for each of `HEADS` but the first. Pairs are of the recall in
+    view and over all floor, and of the mean and longest update.
+    """
     return (
-        _joined(_text(row.cell_m and 100 * row.cell_m, '{:g} cm'), _text(row.keyframes, '{:d}')),
-        _text(row.precision_percent, '{:.1f} %'),
-        _pair(row.recall_seen_percent, row.recall_all_percent, '{:.1f}', ' %'),
-        _joined(update, _text(row.update_mb, '{:.2g} MB')),
-        _joined(*costs),
+        _joined(_text(row.cell_m and 100 * row.cell_m, '{:g}'), _text(row.keyframes, '{:d}')),
+        _joined(
+            _text(row.precision_percent, '{:.1f}'),
+            _pair(row.recall_seen_percent, row.recall_all_percent, '{:.1f}'),
+        ),
+        _joined(_pair(row.update_s, row.update_max_s, '{:.2f}'), _text(row.update_mb, '{:.2g}')),
+        _joined(
+            _text(row.path_error_m and 1000 * row.path_error_m, '{:.1f}'),
+            _text(row.cpu_s, '{:.0f}'),
+            _text(row.peak_mb, '{:.0f}'),
+        ),
         row.source or 'here',
     )
 
 
 def _joined(*parts: str) -> str:
-    return ', '.join(part for part in parts if part)
+    return '; '.join(part for part in parts if part)
 
 
 def _text(value: float | None, form: str) -> str:
     return '' if value is None else form.format(value)
 
 
-def _pair(first: float | None, second: float | None, form: str, unit: str) -> str:
+def _pair(first: float | None, second: float | None, form: str) -> str:
     if first is None and second is None:
         return ''
-    return ' / '.join(_text(value, form) or '–' for value in (first, second)) + unit
+    return '/'.join(_text(value, form) or '–' for value in (first, second))
 
 
 def page_table(rows: Sequence[Row]) -> str:
     """Return rows that are scored as a table of Markdown: scene by scene, what is measured here
-    before what is published.
+    before what is published. The page names the source of precision and recall once (`TABLES`).
     """
     lines = [HEADS, ('---',) * len(HEADS)]
     for scene in PUBLISHED:
         own = [row for row in rows if row.scene == scene]
+        own.sort(key=lambda row: (row.system.startswith('RTAB'), row.system))
         lines += [
-            (f'{scene}: {row.system}', *cells_of(row))
+            (
+                f'{scene}: {row.system}',
+                *cells_of(row)[:-1],
+                row.source.replace(TABLES, '').strip('; '),
+            )
             for row in (*own, *PUBLISHED[scene].rows)
             if row.precision_percent is not None
         ]

@@ -133,7 +133,7 @@ def all_rows(measured: Sequence[PathRow]) -> list[PathRow]:
     return [*rows, *RECORDINGS, *FRAME_TIMES]
 
 
-PAGE_HEADS = ('drive', 'true', 'ORB-SLAM3', 'DynaSLAM', 'true here', *MODES)
+PAGE_HEADS = ('drive', 'true, m', 'ORB-SLAM3', 'DynaSLAM', 'true here', *MODES)
 
 
 def paths_table(measured: Sequence[PathRow]) -> str:
@@ -149,8 +149,8 @@ def paths_table(measured: Sequence[PathRow]) -> str:
         lines.append(
             (
                 orb.drive,
-                *(f'{value:.2f} m' for value in (orb.true_length_m, orb.length_m, dyna.length_m)),
-                '' if true_m is None else f'{true_m:.2f} m',
+                *(f'{value:.2f}' for value in (orb.true_length_m, orb.length_m, dyna.length_m)),
+                '' if true_m is None else f'{true_m:.2f}',
                 *(_ours(ours.get(system)) for system in MODES),
             )
         )
@@ -165,4 +165,4 @@ def _ours(row: PathRow | None) -> str:
     if row is None:
         return ''
     tracked = '' if row.tracked_percent == 100 else f', {row.tracked_percent:.0f} % tracked'
-    return f'{row.length_m:.2f} m, {row.error_m:.3f} m off{tracked}'
+    return f'{row.length_m:.2f}, {row.error_m:.3f} off{tracked}'

@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 import pytest
 from rich.console import Console
+from stereo_drive import room_drive, write_kitti
+from stereo_room import MOUNT
 
 from segfloor_ros.apps.map_files import load_map
 from segfloor_ros.apps.simulation.scene_file import open_scene, shipped
@@ -29,6 +31,7 @@ from tools.benchmark_published import (
 )
 from tools.published_figures import HEADS, PUBLISHED, Row, page_table, parse_scenes
 from tools.published_paths import DRIVES, PAGE_HEADS, PathRow, paths_table, run_drive
+from tools.published_peers import RUNNERS, SlamRow, run_peers, slam_table
 
 CONFIGURATION = resolve()
 
@@ -64,27 +67,34 @@ def test_only_specks_within_free_floor_are_removed():
 
 def test_rows_are_kept_by_scene_and_system(tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark_published, 'KEPT', tmp_path / 'published.json')
-    keep([Row('corridor1', 'a', precision_percent=1.23456), Row('corridor2', 'a')], [], 'once')
+    keep(Row('corridor1', 'a', precision_percent=1.23456), Row('corridor2', 'a'), source='once')
     keep(
-        [Row('corridor1', 'a', precision_percent=99.0), Row('corridor1', 'b')],
-        [PathRow('town', next(iter(published_paths.MODES)), '', 50.0, 51.0, 90.0, 0.1, 0.03)],
-        'again',
+        Row('corridor1', 'a', precision_percent=99.0),
+        Row('corridor1', 'b'),
+        PathRow('town', next(iter(published_paths.MODES)), '', 50.0, 51.0, 90.0, 0.1, 0.03),
+        SlamRow('corridor1', 'RTAB-Map', '', '', 98.76, 0.01234, 9.8, 123.4),
+        SlamRow('corridor1', 'ORB-SLAM2', problem='no such file'),
+        source='again',
     )
     document = json.loads((tmp_path / 'published.json').read_text())
-    assert document['about'] == 'again'
+    assert [row['source'] for row in document['rows']] == ['again', 'once', 'again']
     rows = [Row(**row) for row in document['rows']]
     assert [(row.scene, row.system) for row in rows] == [
         ('corridor1', 'a'), ('corridor2', 'a'), ('corridor1', 'b')
     ]  # fmt: skip
     assert rows[0].precision_percent == 99.0
     paths = paths_table([PathRow(**row) for row in document['paths']])
-    assert '| Husky 01, S | 53.54 m | 56.81 m | 55.67 m |' in paths
-    assert '| KITTI 00 | 3662.13 m | 3083.56 m | 3290.67 m |' in paths
-    assert '| 51.00 m | 50.00 m, 0.100 m off, 90 % tracked |  |' in paths
+    assert '| Husky 01, S | 53.54 | 56.81 | 55.67 |' in paths
+    assert '| KITTI 00 | 3662.13 | 3083.56 | 3290.67 |' in paths
+    assert '| 51.00 | 50.00, 0.100 off, 90 % tracked |  |' in paths
     assert all(line.count('|') == len(PAGE_HEADS) + 1 for line in paths.splitlines())
+    slam = slam_table([SlamRow(**row) for row in document['slam']])
+    assert '| drive | RTAB-Map | ORB-SLAM2 |' in slam
+    assert '| corridor1 | 98.8 % tracked, 12.3, 10, 123 | failed |' in slam
+    assert slam.endswith('Measured: again.\n')
     page = page_table(rows)
     lines = [line.strip('| ').split(' | ') for line in page.splitlines()]
-    assert lines[2][0] == 'corridor1: a' and lines[2][2] == '99.0 %'
+    assert lines[2][0] == 'corridor1: a' and lines[2][2] == '99.0'
     assert all(line.count('|') == len(HEADS) + 1 for line in page.splitlines())
 
 
@@ -135,6 +145,33 @@ def test_the_runner_of_rtabmap_maps_the_same_drive(tmp_path):
     program.write_text('#!/bin/sh\necho no such folder\nexit 3\n')
     with pytest.raises(SegfloorError, match='status 3: no such folder'):
         run_rtabmap(program, 'corridor1', tmp_path, lambda what, total: lambda done: None)
+
+
+def test_other_programs_estimate_the_same_path(tmp_path):
+    """Stand-ins for them write the true path of a drive, which is also mapped here."""
+    frames, poses = room_drive(12)
+    recording = write_kitti(tmp_path / 'room', frames)
+    rows = [(pose @ MOUNT.T_base_left)[:3].ravel() for pose in poses]
+    np.savetxt(recording / 'poses.txt', rows)
+    for folder in ('bin', 'vocab'):
+        (tmp_path / folder).mkdir()
+    for program in ('rtabgrid', 'orb_kitti'):
+        runner = RTABGRID.format(python=sys.executable).replace("words[0] == 'slam'", 'True')
+        (tmp_path / 'bin' / program).write_text(runner)
+        (tmp_path / 'bin' / program).chmod(0o755)
+    stella = tmp_path / 'bin' / 'stella_kitti'
+    stella.write_text('#!/bin/sh\necho vocabulary $1\nexit 3\n')
+    stella.chmod(0o755)
+    found = run_peers('room', recording, tmp_path, tmp_path / 'paths', lambda what, total: None)
+    rows = {row.system: row for row in found}
+    assert list(rows) == ['segfloor_ros', *list(RUNNERS)[:-1]]  # the last has no runner here
+    for name in ('RTAB-Map', 'ORB-SLAM2'):
+        assert rows[name].path_error_m == pytest.approx(0.0, abs=1e-6)
+    for row in (rows['segfloor_ros'], rows['RTAB-Map']):
+        assert row.tracked_percent == 100 and row.path_error_m < 0.02
+        assert row.peak_mb > 1 and row.cpu_s > 0.01
+    assert 'vocabulary none' in rows['stella_vslam, no loops'].problem
+    assert f'vocabulary {tmp_path}/vocab/orb.fbow' in rows['stella_vslam'].problem
 
 
 @pytest.mark.slow
@@ -188,7 +225,7 @@ def test_a_scene_is_rendered_once_mapped_and_scored(tmp_path):
     assert '…' not in text
     row = next(line for line in text.split('\n') if ' Segfloor ' in line)
     cells = [cell.strip() for cell in row.split('│')]
-    assert cells[2:6] == ['1 cm, 220', '99.6 %', '– / 97.2 %', '– / 0.38 s']
+    assert cells[2:5] == ['1; 220', '99.6; –/97.2', '–/0.38']
     document = json.loads(json.dumps(as_document([first], [first.row])))
     assert document['rows'][0]['scene'] == 'corridor2'
     assert document['published'][0]['system'] == 'Segfloor'

@@ -11,13 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.contracts import (
-    POINT_OBSTACLE,
-    FloorScan,
-    KeyframeFeatures,
-    KeyframePath,
-    LabelledPoints,
-)
+from segfloor_ros.core.contracts import POINT_OBSTACLE, FloorScan, KeyframeFeatures, LabelledPoints
 from segfloor_ros.core.files.arrays import Arrays
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.grid.keyframe_evidence import (
@@ -45,20 +39,8 @@ class PublishedMapper(OccupancyGridMapper):
 
     def __init__(self, settings: OccupancyGridSettings) -> None:
         super().__init__(settings)
-        self._gather = rays_to_floor
+        self._gather = self._take_in
         self._obstacle_xy_m: NDArray[np.float32] = np.zeros((0, 2), np.float32)
-
-    def update(
-        self,
-        stamp_ns: int,
-        points: LabelledPoints,
-        features: KeyframeFeatures,
-        path: KeyframePath,
-        scan: FloorScan,
-    ) -> None:
-        """Take in one keyframe; its floor scan is not used."""
-        super().update(stamp_ns, points, features, path, scan)
-        self._obstacle_xy_m = points.xyz_map[points.label == POINT_OBSTACLE, :2]
 
     def grid(self) -> OccupancyGrid:
         """Return the sum of both layers: unknown where neither has anything, occupied where the
@@ -102,33 +84,35 @@ class PublishedMapper(OccupancyGridMapper):
         start = np.tile([x, y], (ends.shape[1], 1))
         return np.stack([start, start + turned.T], axis=1)
 
-
-def rays_to_floor(
-    points: LabelledPoints,
-    features: KeyframeFeatures,
-    T_map_base: Array,
-    scan: FloorScan,
-    settings: OccupancyGridSettings,
-) -> KeyframeEvidence:
-    """Return the ends of the rays to the floor points that a keyframe at T_map_base (4, 4) sees;
-    outliers are dropped (equations 5.3 to 5.5), and rays longer than `max_range_m` end there.
-    """
-    floor, _ = seen_points(points, features, T_map_base)
-    length_m = np.hypot(floor[:, 0], floor[:, 1])
-    if len(floor):
-        kept = (length_m > 0) & (length_m <= ray_length_limit(length_m))
-        floor, length_m = floor[kept], length_m[kept]
-    if settings.max_range_m > 0:
-        floor = floor * np.minimum(1.0, settings.max_range_m / length_m)[:, None]
-    nothing = np.zeros(0, np.float16)
-    return KeyframeEvidence(
-        first_rad=0.0,
-        step_rad=scan.angle_increment_rad,
-        fan_m=nothing,
-        positions_m=floor.T.astype(np.float16),
-        num_rays=len(floor),
-        num_contacts=0,
-        thickness_m=nothing,
-        sure_range_m=0.0,
-        movable_m=nothing.reshape(2, 0),
-    )
+    def _take_in(
+        self,
+        points: LabelledPoints,
+        features: KeyframeFeatures,
+        T_map_base: Array,
+        scan: FloorScan,
+        settings: OccupancyGridSettings,
+    ) -> KeyframeEvidence:
+        """Keep the obstacle points, and return the ends of the rays to the floor points that a
+        keyframe at T_map_base (4, 4) sees; outliers are dropped (equations 5.3 to 5.5), and rays
+        longer than `max_range_m` end there. The floor scan is not used.
+        """
+        self._obstacle_xy_m = points.xyz_map[points.label == POINT_OBSTACLE, :2]
+        floor, _ = seen_points(points, features, T_map_base)
+        length_m = np.hypot(floor[:, 0], floor[:, 1])
+        if len(floor):
+            kept = (length_m > 0) & (length_m <= ray_length_limit(length_m))
+            floor, length_m = floor[kept], length_m[kept]
+        if settings.max_range_m > 0:
+            floor = floor * np.minimum(1.0, settings.max_range_m / length_m)[:, None]
+        nothing = np.zeros(0, np.float16)
+        return KeyframeEvidence(
+            first_rad=0.0,
+            step_rad=scan.angle_increment_rad,
+            fan_m=nothing,
+            positions_m=floor.T.astype(np.float16),
+            num_rays=len(floor),
+            num_contacts=0,
+            thickness_m=nothing,
+            sure_range_m=0.0,
+            movable_m=nothing.reshape(2, 0),
+        )
