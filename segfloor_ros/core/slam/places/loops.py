@@ -41,6 +41,7 @@ from segfloor_ros.core.slam.sparse_map import (
 )
 from segfloor_ros.core.slam.thresholds import ENOUGH, PROOF
 from segfloor_ros.core.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels
+from segfloor_ros.core.slam.tracking.track import Track
 from segfloor_ros.core.twists import is_within
 
 DRIFT_PER_M = 0.01, 0.0025
@@ -93,7 +94,11 @@ class LoopDetector:
         reach_m, reach_rad = (REACH_SIGMAS * sigma for sigma in drift_sigma(lengths_m))
         shown = self._places.shown_from(keyframe.T_world_camera, reach_m, reach_rad)
         by_look = self._matcher.look(keyframe, images, ~near & shown, near)
-        found = [by_look] if by_look else self._from_above(keyframe, ~near, reach_m)
+        if by_look is None:
+            found = self._from_above(keyframe, ~near, reach_m)
+        else:  # what repeats itself fits where the path has the keyframe, too
+            here = self._matcher.at(keyframe, images, keyframe.T_camera_world, ~near & shown, near)
+            found = [by_look, here] if here else [by_look]
 
         def travel(match: Match) -> float:
             return likely_drift(keyframe, match, float(lengths_m[match.place]))
@@ -191,20 +196,39 @@ class PlaceMatcher:
         """Look for the place where the keyframes before saw it, else by its look. may_show, near:
         which keyframes (K,) of the known map may be of the place, and which are of the view itself.
         """
-        own_ids, track = self._known.points_of(np.flatnonzero(near)), None
-        features = features_of(self._map, keyframe)
         before = self.sightings.views
         if before:
             pose = keyframe.T_camera_world @ drift(self._map, before[-1])
-            depth_m = median_depth_m(self._map, keyframe.seen_ids, keyframe.T_camera_world)
-            around = views_near(self._known, pose, depth_m, len(may_show))
-            ids = self._places.points_of(around[may_show[around]][:NEIGHBOURS], own_ids)
-            track = self._places.confirm(images, features, ids, pose)
-        if track is None:
-            is_bounded = self._known is self._map
-            track = self._places.find(images, features, may_show, own_ids, is_bounded=is_bounded)
-        if track is None:
-            return None
+            again = self.at(keyframe, images, pose, may_show, near)
+            if again is not None:
+                return again
+        own_ids, is_bounded = self._own(near), self._known is self._map
+        features = features_of(self._map, keyframe)
+        track = self._places.find(images, features, may_show, own_ids, is_bounded=is_bounded)
+        return None if track is None else self._match(keyframe, track, may_show)
+
+    def at(
+        self,
+        keyframe: KeyframeRecord,
+        images: Pixels,
+        T_camera_world: Array,
+        may_show: NDArray[np.bool_],
+        near: NDArray[np.bool_],
+    ) -> Match | None:
+        """Look for the place at a pose (4, 4) alone. may_show, near: as in `look`."""
+        depth_m = median_depth_m(self._map, keyframe.seen_ids, keyframe.T_camera_world)
+        around = views_near(self._known, T_camera_world, depth_m, len(may_show))
+        ids = self._places.points_of(around[may_show[around]][:NEIGHBOURS], self._own(near))
+        features = features_of(self._map, keyframe)
+        track = self._places.confirm(images, features, ids, T_camera_world)
+        return None if track is None else self._match(keyframe, track, may_show)
+
+    def _own(self, near: NDArray[np.bool_]) -> NDArray[np.int32]:
+        """Return the points that a view sees itself."""
+        return self._known.points_of(np.flatnonzero(near))
+
+    def _match(self, keyframe: KeyframeRecord, track: Track, may_show: NDArray[np.bool_]) -> Match:
+        """Return what a keyframe sees again where it was tracked in the known map."""
         assert track.observed is not None
         rows = np.flatnonzero(track.observed.point_id != NO_POINT)
         ids = track.observed.point_id[rows]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from segfloor_ros.core.plugins.maps.map_arrays import fill_map, map_to_arrays, m
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.slam.mapping import back_end
 from segfloor_ros.core.slam.mapping.bundle_adjustment import move_keyframes
-from segfloor_ros.core.slam.places.evidence import HOPELESS
+from segfloor_ros.core.slam.places.evidence import HOPELESS, PlaceEvidence
 from segfloor_ros.core.slam.places.loop_closing import apply_closing, optimise, plan_closing
 from segfloor_ros.core.slam.places.loops import PlaceMatcher, is_no_drift
 from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition
@@ -269,3 +270,24 @@ def test_two_places_that_look_alike_are_none_unless_drift_bounds_where_the_camer
     everywhere = np.ones(len(twice.keyframes), bool)
     track = places.find(view.observations, view.features, everywhere, is_bounded=is_bounded)
     assert (track is not None) is is_bounded
+
+
+def test_a_place_that_fits_as_well_where_the_path_has_the_camera_is_no_loop(closed, monkeypatch):
+    """What repeats itself fits some steps farther on, too."""
+    slam, _ = closed
+    loops, keyframe = slam.back_end.loops, slam.map.keyframes[-1]
+    latest = np.arange(len(slam.map.keyframes)) > keyframe.index - 5
+    monkeypatch.setattr(loops, '_linked', lambda _: latest)
+    monkeypatch.setattr(
+        PlaceMatcher,
+        'evidence',
+        lambda self, keyframe, match, travel: PlaceEvidence(look=match.log_ratio, travel=travel),
+    )
+    pixels, pose = keyframe.observations, keyframe.T_camera_world
+    here = loops._matcher.at(keyframe, pixels, pose, ~latest, latest)
+    step = se3_exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    monkeypatch.setattr(
+        loops._matcher, 'look', lambda *_: replace(here, T_camera_world=step @ pose)
+    )
+    loops.detect(keyframe, pixels)
+    assert loops.candidates[-1].verdict == 'no drift'
