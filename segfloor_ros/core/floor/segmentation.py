@@ -23,6 +23,7 @@ from segfloor_ros.core.contracts import (
     FloorScan,
     Mount,
 )
+from segfloor_ros.core.errors import CalibrationError
 from segfloor_ros.core.floor.disparity.matching import BLOCK_PX, TwoScaleMatcher, disparity_range
 from segfloor_ros.core.floor.disparity.profile import (
     STEP_PX,
@@ -200,6 +201,11 @@ class FloorSegmentation:
     def _prepare(self, mount: Mount) -> None:
         if mount == self._mount:
             return
+        if mount.up_in_camera[1] >= 0:
+            raise CalibrationError(
+                f'the mount of the left camera, rolled by {mount.roll_rad:.2f} and pitched by '
+                f'{mount.pitch_rad:.2f} rad, turns it upside down: turn its images, and its mount'
+            )
         self._make_tools(mount)
         self._mount, self.fixture = mount, Fixture()
 
