@@ -194,7 +194,7 @@ def judge(frame: FrameEvidence) -> NDArray[np.uint8]:
     mask = np.full(off.shape, NO_EVIDENCE, np.uint8)
     mask[may_be & ~(compared.against | compared.unlike)] = FLOOR
     mask[above & sure] = NOT_FLOOR
-    mask[_below_contact(view, heights.floor_row, above & sure & heights.near)] = NOT_FLOOR
+    mask[_below_contact(frame, above & sure & heights.near)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
     return mask
 
@@ -243,17 +243,19 @@ def _mean_of_neighbours(sigmas: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(share > LEAST_KNOWN, mean, np.float32(np.nan))
 
 
-def _below_contact(
-    view: FloorView, floor_row: NDArray[np.float32], low: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def _below_contact(frame: FrameEvidence, low: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the pixels between the foot of an upright surface and where it meets the floor.
 
-    They are lower than a step but belong to the same surface: its disparity says at which row
-    the floor is. floor_row: as of `Heights`.
+    They are lower than a step but belong to the same surface: its disparity and its height say at
+    which row the floor is, farther from a camera that looks down than what is above it.
     """
+    view, heights = frame.view, frame.heights
     height, width = low.shape
     rows, columns = pixels_where(low)
-    foot = floor_row[low] - (view.shear_px.take(columns) + np.float32(view.first_row))
+    farther = -view.mount.up_in_camera[2] / view.camera.disparity_times_depth
+    farther = 1 + np.float32(farther) * heights.height[low] * frame.disparity_px[low]
+    foot = (heights.floor_row[low] - np.float32(view.line.horizon)) / farther
+    foot += np.float32(view.line.horizon - view.first_row) - view.shear_px.take(columns)
     end = np.clip(foot.astype(np.int32), rows, height - 1) + 1
     covered = np.zeros((height + 1, width), np.int16)
     covered[:height] = low
