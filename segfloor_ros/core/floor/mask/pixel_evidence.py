@@ -298,7 +298,9 @@ def compare(
     foreign = _foreign(sampled, as_floor, lying, noise_grey)
     margin = _AGAINST_GREY + 0.5 * noise_grey
     against = (matched_px > 0) & (floor > 1.3 * matched + np.float32(margin))
-    unlike = floor > _LIKENESS_GREY + _NOISE_SHARE * noise_grey
+    unlike = floor > _LIKENESS_GREY + _NOISE_SHARE * _noise(
+        noise_grey, matched / _NOISE_SHARE, lying
+    )
     wide = (_WIDE_WINDOW, _WIDE_WINDOW)
     denied = cv2.blur(floor, wide) > _WIDE_RATIO * cv2.blur(matched, wide) + _WIDE_MARGIN_GREY
     worse = floor > 1.1 * matched
@@ -318,7 +320,7 @@ def _foreign(
     """Return where the left image (R, W) has texture that the right one, drawn as if all were
     floor, has not: what stands so near, or so askew, that it is not matched at all.
 
-    lying: where what is matched lies on the floor; what the two differ by there is noise, too.
+    lying: where what is matched lies on the floor.
     """
     window = (_WIDE_WINDOW, _WIDE_WINDOW)
     a, b = left.astype(np.float32), right.astype(np.float32)
@@ -326,13 +328,19 @@ def _foreign(
     variance = np.maximum(cv2.blur(a * a, window) - mean_a**2, np.float32(1e-3))
     other = np.maximum(cv2.blur(b * b, window) - mean_b**2, np.float32(1e-3))
     shared = cv2.blur(a * b, window) - mean_a * mean_b
-    noise = noise_grey**2
-    if np.count_nonzero(lying) > window[0] * window[1]:
-        noise = max(noise, float(np.median((variance + other)[lying] / 2 - shared[lying])))
+    noise = _noise(noise_grey**2, (variance + other) / 2 - shared, lying)
     expected = 1 - np.float32(noise) / variance
     texture, least = _FOREIGN
     differs: NDArray[np.bool_] = shared < least * expected * np.sqrt(variance * other)
     return differs & (expected > texture)
+
+
+def _noise(least: float, differs: NDArray[np.float32], lying: NDArray[np.bool_]) -> float:
+    """Return what images differ by where what is matched lies on the floor (R, W), in the median:
+    noise, blur and rows that are not quite the same; at least what is known without.
+    """
+    is_enough = np.count_nonzero(lying) > _WIDE_WINDOW**2
+    return max(least, float(np.median(differs[lying]))) if is_enough else least
 
 
 def _local_difference(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
