@@ -362,7 +362,7 @@ def expectations(mount: Mount, T_map_base: Array | None) -> Array:
     # A height that nothing can have is none, and a base that lies on its back sees no floor.
     heights_m = np.maximum((mount.height_m, T_map_left[2, 3]), HEIGHT_RANGE_M[0])
     of_map = angles_height_of(T_map_left[2, :3] / heights_m[:, None])
-    return np.vstack([mounted, of_map[plausible(of_map)]])
+    return np.vstack([mounted, of_map[np.abs(of_map[:, 1]) < math.pi / 2]])
 
 
 def plane_of_frame(
