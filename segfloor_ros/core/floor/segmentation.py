@@ -202,10 +202,7 @@ class FloorSegmentation:
         if mount == self._mount:
             return
         if mount.up_in_camera[1] >= 0:
-            raise CalibrationError(
-                f'the mount of the left camera, rolled by {mount.roll_rad:.2f} and pitched by '
-                f'{mount.pitch_rad:.2f} rad, turns it upside down: turn its images, and its mount'
-            )
+            raise CalibrationError(f'{mount} hangs upside down: turn the images, and their mount')
         self._make_tools(mount)
         self._mount, self.fixture = mount, Fixture()
 
@@ -216,10 +213,9 @@ class FloorSegmentation:
         self._scanner = FloorScanner(self._camera, mount, self._settings)
 
     def _matched(self, pair: Pair) -> NDArray[np.float32]:
-        settings, camera = self._settings, self._camera
-        top = 0 if settings.disparity_above_horizon else pair.first_row
+        top = 0 if self._settings.disparity_above_horizon else pair.first_row
         assert self._mount is not None
-        fine_rows = last_fine_row(camera, self._mount) - top
+        fine_rows = last_fine_row(self._camera, self._mount) - top
         disparity = np.zeros(pair.left.shape, np.float32)
         disparity[top:] = self._matcher.compute(pair.left[top:], pair.right[top:], fine_rows)
         return disparity
@@ -263,8 +259,7 @@ class FloorSegmentation:
         floor &= mask.take(v * np.int32(mask.shape[1]) + u, mode='clip') == FLOOR
         shared = u * view.step >= floor_px + np.float32(_BORDER_BLOCKS * BLOCK_PX)
         # At half the resolution a pixel tells of four, here of two or, in every other column, four.
-        hanging_xy = np.repeat(hanging_xy, _BOARD * 2 // view.step, axis=1)
-        upright_xy = np.hstack([upright_xy, hanging_xy])
+        upright_xy = np.hstack([upright_xy, np.repeat(hanging_xy, _BOARD * 2 // view.step, axis=1)])
         feet_xy, density = _feet(frame, mask), 1 / (2 * view.step)
         return self._scanner.scan(floor, shared, upright_xy, feet_xy, density, movable_xy)
 

@@ -47,7 +47,7 @@ _CONTACT_HEIGHT_M = 0.12
 """Up to this height an upright surface is taken to stand on the floor below it."""
 
 
-_NEIGHBOURS_PX = 9
+_NEIGHBOURS_PX = 9, 9
 """Heights are averaged over so wide a square; ones that are matched err together."""
 _MOST_SIGMAS = np.float32(10)
 
@@ -55,7 +55,7 @@ _AGAINST_GREY = 1.0
 """By how much the images must contradict the floor to deny it, beyond their noise."""
 _LIKENESS_GREY = 3.0
 """How much left and right may differ on the floor, beyond their noise."""
-_WIDE_WINDOW, _WIDE_RATIO, _WIDE_MARGIN_GREY, _WIDE_SHARE = 15, 1.15, 0.05, 0.65
+_WIDE, _WIDE_RATIO, _WIDE_MARGIN_GREY, _WIDE_SHARE = (15, 15), 1.15, 0.05, 0.65
 """What too little texture leaves open in a small window a larger one often tells: floor is denied
 there where it differs by this much more than what was matched, over so much of the window."""
 _FOREIGN = 0.4, 0.3
@@ -236,10 +236,9 @@ def _mean_of_neighbours(sigmas: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the mean of what is known around each pixel (R, W), NaN where that is too little. One
     that is far off counts for no more than a few.
     """
-    window = (_NEIGHBOURS_PX, _NEIGHBOURS_PX)
     known = np.isfinite(sigmas)
     bounded = np.clip(np.where(known, sigmas, np.float32(0)), -_MOST_SIGMAS, _MOST_SIGMAS)
-    mean, share = mean_of_known(bounded, known.astype(np.float32), window)
+    mean, share = mean_of_known(bounded, known.astype(np.float32), _NEIGHBOURS_PX)
     return np.where(share > LEAST_KNOWN, mean, np.float32(np.nan))
 
 
@@ -295,18 +294,13 @@ def compare(
     matched = _local_difference(sampled, as_matched)
     floor = _local_difference(sampled, as_floor)
     lying &= reached & (np.abs(matched_px - floor_px) < np.float32(SAME_PX))
-    foreign = _foreign(sampled, as_floor, lying, noise_grey)
-    margin = _AGAINST_GREY + 0.5 * noise_grey
-    against = (matched_px > 0) & (floor > 1.3 * matched + np.float32(margin))
-    unlike = floor > _LIKENESS_GREY + _NOISE_SHARE * _noise(
-        noise_grey, matched / _NOISE_SHARE, lying
-    )
-    wide = (_WIDE_WINDOW, _WIDE_WINDOW)
-    denied = cv2.blur(floor, wide) > _WIDE_RATIO * cv2.blur(matched, wide) + _WIDE_MARGIN_GREY
+    against = (matched_px > 0) & (floor > 1.3 * matched + (_AGAINST_GREY + 0.5 * noise_grey))
+    unlike = floor > _LIKENESS_GREY + _noise(_NOISE_SHARE * noise_grey, matched, lying)
+    denied = cv2.blur(floor, _WIDE) > _WIDE_RATIO * cv2.blur(matched, _WIDE) + _WIDE_MARGIN_GREY
     worse = floor > 1.1 * matched
     denied &= (matched_px > 0) & worse
-    denied &= cv2.blur(worse.astype(np.float32), wide) > _WIDE_SHARE
-    contrary = against | denied | foreign
+    denied &= cv2.blur(worse.astype(np.float32), _WIDE) > _WIDE_SHARE
+    contrary = against | denied | _foreign(sampled, as_floor, lying, noise_grey)
     contrary |= floor > 2 * _LIKENESS_GREY + _NOISE_SHARE * noise_grey
     against, denied, unlike, contrary = (
         enlarged(mask & reached, disparity) for mask in (against, denied, unlike, contrary)
@@ -322,12 +316,11 @@ def _foreign(
 
     lying: where what is matched lies on the floor.
     """
-    window = (_WIDE_WINDOW, _WIDE_WINDOW)
     a, b = left.astype(np.float32), right.astype(np.float32)
-    mean_a, mean_b = cv2.blur(a, window), cv2.blur(b, window)
-    variance = np.maximum(cv2.blur(a * a, window) - mean_a**2, np.float32(1e-3))
-    other = np.maximum(cv2.blur(b * b, window) - mean_b**2, np.float32(1e-3))
-    shared = cv2.blur(a * b, window) - mean_a * mean_b
+    mean_a, mean_b = cv2.blur(a, _WIDE), cv2.blur(b, _WIDE)
+    variance = np.maximum(cv2.blur(a * a, _WIDE) - mean_a**2, np.float32(1e-3))
+    other = np.maximum(cv2.blur(b * b, _WIDE) - mean_b**2, np.float32(1e-3))
+    shared = cv2.blur(a * b, _WIDE) - mean_a * mean_b
     noise = _noise(noise_grey**2, (variance + other) / 2 - shared, lying)
     expected = 1 - np.float32(noise) / variance
     texture, least = _FOREIGN
@@ -339,7 +332,7 @@ def _noise(least: float, differs: NDArray[np.float32], lying: NDArray[np.bool_])
     """Return what images differ by where what is matched lies on the floor (R, W), in the median:
     noise, blur and rows that are not quite the same; at least what is known without.
     """
-    is_enough = np.count_nonzero(lying) > _WIDE_WINDOW**2
+    is_enough = np.count_nonzero(lying) > _WIDE[0] * _WIDE[1]
     return max(least, float(np.median(differs[lying]))) if is_enough else least
 
 

@@ -447,10 +447,8 @@ def _likeliest(samples: Samples, prior: FramePrior) -> Array:
     raised[:, 2] = 1.0
     depth_m = samples.disparity_m / samples.disparity_px[on]
     raised[:, 2] = -depth_m * (plane_of(raised) * samples.rays[on]).sum(axis=1)
-    guesses, few = (
-        np.vstack([prior.means, drawn[plausible(drawn)]]),
-        samples.every(int(_CORRELATED_SAMPLES)),
-    )
+    guesses = np.vstack([prior.means, drawn[plausible(drawn)]])
+    few = samples.every(int(_CORRELATED_SAMPLES))
     return np.asarray(guesses[np.argmax(prior.log_posterior(few, guesses))])
 
 
