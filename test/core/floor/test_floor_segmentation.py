@@ -399,3 +399,16 @@ def test_images_that_differ_everywhere_are_compared_by_how_much_they_do():
     called = observation.mask == FLOOR
     assert called[floor & (depth < 4.0)].mean() > 0.5
     assert floor[called].mean() > 0.99
+
+
+@pytest.mark.parametrize('reflectance', [0.15, 0.6])
+@pytest.mark.parametrize('contrast', [4.0, 18.0])
+def test_what_a_floor_mirrors_is_no_obstacle_and_what_stands_on_it_no_floor(contrast, reflectance):
+    """The image in the floor is seen as far below it as what it is of stands above."""
+    things = [wall(3.0, contrast=40.0), *box(1.4, 0.3, 0.3, 0.3), *box(1.8, -0.6, 0.3, 0.4)]
+    floor = floor_patch(contrast=contrast, grey=150.0)
+    scene = Scene([floor, *things], SMALL_CAMERA, reflectance=reflectance)
+    observation, is_floor, depth = segment(scene)
+    assert (observation.mask == NOT_FLOOR)[is_floor & (depth < 3.0)].mean() < 0.03
+    assert (observation.mask == FLOOR)[~is_floor & np.isfinite(depth)].mean() < 0.001
+    assert not (observation.scan.obstacle_m < 1.3).any()
