@@ -94,14 +94,13 @@ class Comparison:
 class Heights:
     """What disparities say of how high pixels lie, (R, W).
 
-    height, noise: above the floor, float32 in metres, and its error, one sigma. floor_row: the
-    de-rolled row of the floor of the same disparity. above, off: bool, higher than floor can be, or
-    lower, too; near: no higher than what is upright and stands on the floor right below.
+    height, noise: above the floor, float32 in metres, and its error, one sigma. above, off: bool,
+    higher than floor can be, or lower, too; near: no higher than what is upright and stands on the
+    floor right below.
     """
 
     height: NDArray[np.float32]
     noise: NDArray[np.float32]
-    floor_row: NDArray[np.float32]
     above: NDArray[np.bool_]
     off: NDArray[np.bool_]
     near: NDArray[np.bool_]
@@ -146,13 +145,13 @@ class Heights:
         # What is nearer than the table goes is no lower than what is as near as that.
         last = np.float32(len(steps) - 1)
         index = np.minimum(disparity * np.float32(SUBPIXEL), last).astype(np.int32)
-        tables = row, scale * row, scale, noise, up, down
-        row, at_row_0, scale, noise, up, down = (
+        tables = scale * row, scale, noise, up, down
+        at_row_0, scale, noise, up, down = (
             table.astype(np.float32).take(index) for table in tables
         )
         height = at_row_0 - scale * view.derolled
         above, near = height > up, height < up + np.float32(_CONTACT_HEIGHT_M)
-        return cls(height, noise, row, above, above | (height < -down), near)
+        return cls(height, noise, above, above | (height < -down), near)
 
 
 @dataclass(frozen=True)
@@ -246,20 +245,21 @@ def _below_contact(frame: FrameEvidence, low: NDArray[np.bool_]) -> NDArray[np.b
     """Return the pixels between the foot of an upright surface and where it meets the floor.
 
     They are lower than a step but belong to the same surface: its disparity and its height say at
-    which row the floor is, farther from a camera that looks down than what is above it.
+    which row the floor is, as far as they may err, and farther from a camera that looks down.
     """
     view, heights = frame.view, frame.heights
-    height, width = low.shape
     rows, columns = pixels_where(low)
-    farther = -view.mount.up_in_camera[2] / view.camera.disparity_times_depth
-    farther = 1 + np.float32(farther) * heights.height[low] * frame.disparity_px[low]
-    foot = (heights.floor_row[low] - np.float32(view.line.horizon)) / farther
-    foot += np.float32(view.line.horizon - view.first_row) - view.shear_px.take(columns)
-    end = np.clip(foot.astype(np.int32), rows, height - 1) + 1
-    covered = np.zeros((height + 1, width), np.int16)
-    covered[:height] = low
+    height_m, px = heights.height[low], frame.disparity_px[low]
+    down = (height_m + np.float32(SIGMAS) * heights.noise[low]) * px
+    down /= np.float32(view.line.metres_per_row)
+    tilt = -view.mount.up_in_camera[2] / view.camera.disparity_times_depth
+    beyond = view.derolled[low] - np.float32(view.line.horizon)
+    foot = rows + (beyond + down) / (1 + np.float32(tilt) * height_m * px) - beyond
+    end = np.clip(foot.astype(np.int32), rows, len(low) - 1) + 1
+    covered = np.zeros((len(low) + 1, low.shape[1]), np.int16)
+    covered[:-1] = low
     covered -= histogram(end, columns, covered.shape).astype(np.int16)
-    return np.cumsum(covered, axis=0, dtype=np.int16)[:height] >= 2
+    return np.cumsum(covered, axis=0, dtype=np.int16)[:-1] >= 2
 
 
 def compare(
