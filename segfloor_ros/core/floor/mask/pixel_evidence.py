@@ -245,13 +245,12 @@ def _below_contact(frame: FrameEvidence, low: NDArray[np.bool_]) -> NDArray[np.b
     """Return the pixels between the foot of an upright surface and where it meets the floor.
 
     They are lower than a step but belong to the same surface: its disparity and its height say at
-    which row the floor is, as far as they may err, and farther from a camera that looks down.
+    which row the floor is, farther from a camera that looks down than what is above it.
     """
     view, heights = frame.view, frame.heights
     rows, columns = pixels_where(low)
     height_m, px = heights.height[low], frame.disparity_px[low]
-    down = (height_m + np.float32(SIGMAS) * heights.noise[low]) * px
-    down /= np.float32(view.line.metres_per_row)
+    down = height_m * px / np.float32(view.line.metres_per_row)
     tilt = -view.mount.up_in_camera[2] / view.camera.disparity_times_depth
     beyond = view.derolled[low] - np.float32(view.line.horizon)
     foot = rows + (beyond + down) / (1 + np.float32(tilt) * height_m * px) - beyond
