@@ -207,11 +207,11 @@ def _look(seen: Seen) -> Picture:
     return look * np.float32(sigmas.any())
 
 
-def _with_border(part: NDArray[np.bool_], window: tuple[int, int] = _BLOCK) -> NDArray[np.bool_]:
-    """Return a part of the picture with its border: there the window that is matched, or over which
-    pixels are averaged, holds both, and the foot of a thing is no higher than the floor.
+def _with_border(part: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return a part of the picture with its border: there the block that is matched holds both, and
+    the foot of a thing is no higher than the floor.
     """
-    return cv2.dilate(part.view(np.uint8), np.ones(window, np.uint8)) > 0
+    return cv2.dilate(part.view(np.uint8), np.ones(_BLOCK, np.uint8)) > 0
 
 
 class Likelihood:
@@ -239,9 +239,7 @@ class Likelihood:
         climbed = unlikely & is_low & (log_ratio > of_height)
         is_higher = judged & (log_ratio < -_SURE) & (every[1] > SIGMAS)
         blocked = (unlikely & ~climbed) | _with_border(is_higher & ~climbed)
-        unlikely |= _with_border(is_higher) | (
-            _with_border(is_higher, _NEAR) & (seen.mask == FLOOR)
-        )
+        unlikely |= _with_border(is_higher)
         climbed = unlikely & ~blocked & (seen.mask != NOT_FLOOR)
         sure = judged & ~seen.lower & (log_ratio > _SURE)
         one_sided = seen.left_only & near_enough & ~judged

@@ -262,19 +262,3 @@ def test_some_matches_where_only_the_left_camera_sees_are_by_chance() -> None:
             assert np.mean(strip[~matched[:, 3:20]] == FLOOR) > 0.9
         else:
             assert not np.any(strip == FLOOR)
-
-
-def test_beside_what_stands_a_mask_has_no_floor_but_the_scan_goes_on() -> None:
-    """There the windows over which pixels are averaged hold both."""
-    seen = ground()
-    stone_px = seen.disparity_px.copy()
-    stone_px[STONE] = seen.floor_px[STONE] + 8
-    mask = np.full(SHAPE, FLOOR, np.uint8)
-    seen = dataclasses.replace(seen, disparity_px=stone_px, mask=mask)
-    weighed, climbed = Likelihood().weighed(mask, seen)
-    rows = np.s_[62:68]
-    assert np.all(weighed[rows, 95:105] == NO_EVIDENCE)
-    for column in (92, 107):
-        assert np.all(weighed[rows, column] == NO_EVIDENCE)
-        assert climbed[rows, column].mean() > 0.5
-    assert np.mean(weighed[rows, 120:140] == FLOOR) > 0.9
