@@ -23,6 +23,7 @@ from segfloor_ros.core.contracts import (
     FloorScan,
     Mount,
 )
+from segfloor_ros.core.errors import CalibrationError
 from segfloor_ros.core.floor.disparity.matching import BLOCK_PX, TwoScaleMatcher, disparity_range
 from segfloor_ros.core.floor.disparity.profile import (
     STEP_PX,
@@ -200,6 +201,12 @@ class FloorSegmentation:
     def _prepare(self, mount: Mount) -> None:
         if mount == self._mount:
             return
+        if mount.up_in_camera[1] >= 0:
+            pitch_deg, roll_deg = np.degrees([mount.pitch_rad, mount.roll_rad])
+            raise CalibrationError(
+                f'pitch {pitch_deg:.0f} deg, roll {roll_deg:.0f} deg: down is up in the image; '
+                'turn both images by 180 deg, exchange left and right, and turn the mount'
+            )
         self._make_tools(mount)
         self._mount, self.fixture = mount, Fixture()
 
@@ -210,9 +217,9 @@ class FloorSegmentation:
         self._scanner = FloorScanner(self._camera, mount, self._settings)
 
     def _matched(self, pair: Pair) -> NDArray[np.float32]:
-        camera, top = self._camera, pair.first_row
+        top = pair.first_row
         assert self._mount is not None
-        fine_rows = last_fine_row(camera, self._mount) - top
+        fine_rows = last_fine_row(self._camera, self._mount) - top
         disparity = np.zeros(pair.left.shape, np.float32)
         disparity[top:] = self._matcher.compute(pair.left[top:], pair.right[top:], fine_rows)
         return disparity
@@ -256,8 +263,7 @@ class FloorSegmentation:
         floor &= mask.take(v * np.int32(mask.shape[1]) + u, mode='clip') == FLOOR
         shared = u * view.step >= floor_px + np.float32(_BORDER_BLOCKS * BLOCK_PX)
         # At half the resolution a pixel tells of four, here of two or, in every other column, four.
-        hanging_xy = np.repeat(hanging_xy, _BOARD * 2 // view.step, axis=1)
-        upright_xy = np.hstack([upright_xy, hanging_xy])
+        upright_xy = np.hstack([upright_xy, np.repeat(hanging_xy, _BOARD * 2 // view.step, axis=1)])
         feet_xy, density = _feet(frame, mask), 1 / (2 * view.step)
         return self._scanner.scan(floor, shared, upright_xy, feet_xy, density, movable_xy)
 

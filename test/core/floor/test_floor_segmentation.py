@@ -360,3 +360,46 @@ def test_a_drop_close_ahead_does_not_take_the_floor_before_it(near, below):
     assert np.mean(observation.mask[floor] == FLOOR) > 0.85
     fallen = ~floor & (points_of(scene, depth)[..., 2] < 0)
     assert np.mean(observation.mask[fallen] == FLOOR) < 0.03
+
+
+def test_what_stands_before_a_camera_that_looks_down_hides_no_floor_before_it():
+    """The foot of a face is farther from such a camera than what is above it."""
+    mount = Mount(1.1, 0.7)
+    scene = Scene([floor_patch(), *box(1.2, 0.0, 0.5, 0.5, contrast=40.0)], mount=mount)
+    observation, floor, depth = segment(scene)
+    stands = ~floor & np.isfinite(depth)
+    near_foot = cv2.dilate(stands.astype(np.uint8), np.ones((35, 1), np.uint8), anchor=(0, 34)) > 0
+    called = observation.mask == FLOOR
+    assert called[near_foot & floor].mean() > 0.75
+    assert called[stands].mean() < 0.001
+
+
+def test_images_that_differ_everywhere_are_compared_by_how_much_they_do():
+    """As those of blocks of a compressed image, or of a blur of only one eye."""
+    scene = Scene([floor_patch(contrast=45.0), wall(), *box(1.2, 0.3, 0.3, 0.3)], SMALL_CAMERA)
+    left, right, floor, depth = scene.render()
+    rng = np.random.default_rng(0)
+
+    def spoilt(image):
+        spots = cv2.GaussianBlur(rng.normal(size=image.shape), (0, 0), 1.5)
+        return np.clip(image + 20 * spots / spots.std(), 0, 255).astype(np.uint8)
+
+    observation = FloorSegmentation(SMALL_CAMERA, SETTINGS).process(
+        spoilt(left), spoilt(right), MOUNT
+    )
+    called = observation.mask == FLOOR
+    assert called[floor & (depth < 4.0)].mean() > 0.5
+    assert floor[called].mean() > 0.99
+
+
+@pytest.mark.parametrize('reflectance', [0.15, 0.6])
+@pytest.mark.parametrize('contrast', [4.0, 18.0])
+def test_what_a_floor_mirrors_is_no_obstacle_and_what_stands_on_it_no_floor(contrast, reflectance):
+    """The image in the floor is seen as far below it as what it is of stands above."""
+    things = [wall(3.0, contrast=40.0), *box(1.4, 0.3, 0.3, 0.3), *box(1.8, -0.6, 0.3, 0.4)]
+    floor = floor_patch(contrast=contrast, grey=150.0)
+    scene = Scene([floor, *things], SMALL_CAMERA, reflectance=reflectance)
+    observation, is_floor, depth = segment(scene)
+    assert (observation.mask == NOT_FLOOR)[is_floor & (depth < 3.0)].mean() < 0.03
+    assert (observation.mask == FLOOR)[~is_floor & np.isfinite(depth)].mean() < 0.001
+    assert not (observation.scan.obstacle_m < 1.3).any()

@@ -91,7 +91,7 @@ def first_floor_row(camera: StereoCamera, mount: Mount) -> int:
     """Return the first row of the image that can show the floor, with a run-up for the matcher."""
     line = FloorLine.of(camera, mount)
     top = math.floor(line.horizon - line.rolled_rows(camera)) - RUN_UP_ROWS
-    return int(np.clip(top, 0, camera.height - 2 * RUN_UP_ROWS))
+    return int(np.clip(top, 0, max(0, camera.height - 2 * RUN_UP_ROWS)))
 
 
 def last_fine_row(camera: StereoCamera, mount: Mount) -> int:
@@ -168,7 +168,7 @@ def fit_profile(v_disparity: VDisparity, line: FloorLine, camera: StereoCamera) 
     rows, bins = pixels_where(counts > 0)
     disparity = bins / v_disparity.bins_per_px
     height = counts.shape[0]
-    start = max(float(first_row), line.horizon)
+    start = np.clip(line.horizon, first_row, first_row + height - 1)
     to_position = SEGMENTS / max(first_row + height - 1 - start, 1.0)
     below = rows + first_row >= start
     rows, bins, disparity = rows[below], bins[below], disparity[below]

@@ -40,7 +40,7 @@ from segfloor_ros.core.geometry import Array
 
 Picture = NDArray[np.float32]
 
-WEIGHTS = {'one': 0.89, 'above': -0.37, 'rises': 1.44, 'steep': -1.34, 'on': 1.43, 'look': 1.31}
+WEIGHTS = {'one': 0.87, 'above': -0.38, 'rises': 1.49, 'steep': -1.34, 'on': 1.11, 'look': 1.35}
 """By feature, made by `tools/fit_floor.py`.
 
 one: of a pixel that shows nothing. above: by how many sigmas it is higher than the floor around it.

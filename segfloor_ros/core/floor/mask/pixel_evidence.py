@@ -47,7 +47,7 @@ _CONTACT_HEIGHT_M = 0.12
 """Up to this height an upright surface is taken to stand on the floor below it."""
 
 
-_NEIGHBOURS_PX = 9
+_NEIGHBOURS_PX = 9, 9
 """Heights are averaged over so wide a square; ones that are matched err together."""
 _MOST_SIGMAS = np.float32(10)
 
@@ -55,7 +55,7 @@ _AGAINST_GREY = 1.0
 """By how much the images must contradict the floor to deny it, beyond their noise."""
 _LIKENESS_GREY = 3.0
 """How much left and right may differ on the floor, beyond their noise."""
-_WIDE_WINDOW, _WIDE_RATIO, _WIDE_MARGIN_GREY, _WIDE_SHARE = 15, 1.15, 0.05, 0.65
+_WIDE, _WIDE_RATIO, _WIDE_MARGIN_GREY, _WIDE_SHARE = (15, 15), 1.15, 0.05, 0.65
 """What too little texture leaves open in a small window a larger one often tells: floor is denied
 there where it differs by this much more than what was matched, over so much of the window."""
 _FOREIGN = 0.4, 0.3
@@ -94,14 +94,13 @@ class Comparison:
 class Heights:
     """What disparities say of how high pixels lie, (R, W).
 
-    height, noise: above the floor, float32 in metres, and its error, one sigma. floor_row: the
-    de-rolled row of the floor of the same disparity. above, off: bool, higher than floor can be, or
-    lower, too; near: no higher than what is upright and stands on the floor right below.
+    height, noise: above the floor, float32 in metres, and its error, one sigma. above, off: bool,
+    higher than floor can be, or lower, too; near: no higher than what is upright and stands on the
+    floor right below.
     """
 
     height: NDArray[np.float32]
     noise: NDArray[np.float32]
-    floor_row: NDArray[np.float32]
     above: NDArray[np.bool_]
     off: NDArray[np.bool_]
     near: NDArray[np.bool_]
@@ -146,13 +145,13 @@ class Heights:
         # What is nearer than the table goes is no lower than what is as near as that.
         last = np.float32(len(steps) - 1)
         index = np.minimum(disparity * np.float32(SUBPIXEL), last).astype(np.int32)
-        tables = row, scale * row, scale, noise, up, down
-        row, at_row_0, scale, noise, up, down = (
+        tables = scale * row, scale, noise, up, down
+        at_row_0, scale, noise, up, down = (
             table.astype(np.float32).take(index) for table in tables
         )
         height = at_row_0 - scale * view.derolled
         above, near = height > up, height < up + np.float32(_CONTACT_HEIGHT_M)
-        return cls(height, noise, row, above, above | (height < -down), near)
+        return cls(height, noise, above, above | (height < -down), near)
 
 
 @dataclass(frozen=True)
@@ -194,7 +193,7 @@ def judge(frame: FrameEvidence) -> NDArray[np.uint8]:
     mask = np.full(off.shape, NO_EVIDENCE, np.uint8)
     mask[may_be & ~(compared.against | compared.unlike)] = FLOOR
     mask[above & sure] = NOT_FLOOR
-    mask[_below_contact(view, heights.floor_row, above & sure & heights.near)] = NOT_FLOOR
+    mask[_below_contact(frame, above & sure & heights.near)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
     return mask
 
@@ -236,29 +235,30 @@ def _mean_of_neighbours(sigmas: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the mean of what is known around each pixel (R, W), NaN where that is too little. One
     that is far off counts for no more than a few.
     """
-    window = (_NEIGHBOURS_PX, _NEIGHBOURS_PX)
     known = np.isfinite(sigmas)
     bounded = np.clip(np.where(known, sigmas, np.float32(0)), -_MOST_SIGMAS, _MOST_SIGMAS)
-    mean, share = mean_of_known(bounded, known.astype(np.float32), window)
+    mean, share = mean_of_known(bounded, known.astype(np.float32), _NEIGHBOURS_PX)
     return np.where(share > LEAST_KNOWN, mean, np.float32(np.nan))
 
 
-def _below_contact(
-    view: FloorView, floor_row: NDArray[np.float32], low: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def _below_contact(frame: FrameEvidence, low: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the pixels between the foot of an upright surface and where it meets the floor.
 
-    They are lower than a step but belong to the same surface: its disparity says at which row
-    the floor is. floor_row: as of `Heights`.
+    They are lower than a step but belong to the same surface: its disparity and its height say at
+    which row the floor is, farther from a camera that looks down than what is above it.
     """
-    height, width = low.shape
+    view, heights = frame.view, frame.heights
     rows, columns = pixels_where(low)
-    foot = floor_row[low] - (view.shear_px.take(columns) + np.float32(view.first_row))
-    end = np.clip(foot.astype(np.int32), rows, height - 1) + 1
-    covered = np.zeros((height + 1, width), np.int16)
-    covered[:height] = low
+    height_m, px = heights.height[low], frame.disparity_px[low]
+    down = height_m * px / np.float32(view.line.metres_per_row)
+    tilt = -view.mount.up_in_camera[2] / view.camera.disparity_times_depth
+    beyond = view.derolled[low] - np.float32(view.line.horizon)
+    foot = rows + (beyond + down) / (1 + np.float32(tilt) * height_m * px) - beyond
+    end = np.clip(foot.astype(np.int32), rows, len(low) - 1) + 1
+    covered = np.zeros((len(low) + 1, low.shape[1]), np.int16)
+    covered[:-1] = low
     covered -= histogram(end, columns, covered.shape).astype(np.int16)
-    return np.cumsum(covered, axis=0, dtype=np.int16)[:height] >= 2
+    return np.cumsum(covered, axis=0, dtype=np.int16)[:-1] >= 2
 
 
 def compare(
@@ -293,16 +293,13 @@ def compare(
     matched = _local_difference(sampled, as_matched)
     floor = _local_difference(sampled, as_floor)
     lying &= reached & (np.abs(matched_px - floor_px) < np.float32(SAME_PX))
-    foreign = _foreign(sampled, as_floor, lying, noise_grey)
-    margin = _AGAINST_GREY + 0.5 * noise_grey
-    against = (matched_px > 0) & (floor > 1.3 * matched + np.float32(margin))
-    unlike = floor > _LIKENESS_GREY + _NOISE_SHARE * noise_grey
-    wide = (_WIDE_WINDOW, _WIDE_WINDOW)
-    denied = cv2.blur(floor, wide) > _WIDE_RATIO * cv2.blur(matched, wide) + _WIDE_MARGIN_GREY
+    against = (matched_px > 0) & (floor > 1.3 * matched + (_AGAINST_GREY + 0.5 * noise_grey))
+    unlike = floor > _LIKENESS_GREY + _noise(_NOISE_SHARE * noise_grey, matched, lying)
+    denied = cv2.blur(floor, _WIDE) > _WIDE_RATIO * cv2.blur(matched, _WIDE) + _WIDE_MARGIN_GREY
     worse = floor > 1.1 * matched
     denied &= (matched_px > 0) & worse
-    denied &= cv2.blur(worse.astype(np.float32), wide) > _WIDE_SHARE
-    contrary = against | denied | foreign
+    denied &= cv2.blur(worse.astype(np.float32), _WIDE) > _WIDE_SHARE
+    contrary = against | denied | _foreign(sampled, as_floor, lying, noise_grey)
     contrary |= floor > 2 * _LIKENESS_GREY + _NOISE_SHARE * noise_grey
     against, denied, unlike, contrary = (
         enlarged(mask & reached, disparity) for mask in (against, denied, unlike, contrary)
@@ -316,21 +313,26 @@ def _foreign(
     """Return where the left image (R, W) has texture that the right one, drawn as if all were
     floor, has not: what stands so near, or so askew, that it is not matched at all.
 
-    lying: where what is matched lies on the floor; what the two differ by there is noise, too.
+    lying: where what is matched lies on the floor.
     """
-    window = (_WIDE_WINDOW, _WIDE_WINDOW)
     a, b = left.astype(np.float32), right.astype(np.float32)
-    mean_a, mean_b = cv2.blur(a, window), cv2.blur(b, window)
-    variance = np.maximum(cv2.blur(a * a, window) - mean_a**2, np.float32(1e-3))
-    other = np.maximum(cv2.blur(b * b, window) - mean_b**2, np.float32(1e-3))
-    shared = cv2.blur(a * b, window) - mean_a * mean_b
-    noise = noise_grey**2
-    if np.count_nonzero(lying) > window[0] * window[1]:
-        noise = max(noise, float(np.median((variance + other)[lying] / 2 - shared[lying])))
+    mean_a, mean_b = cv2.blur(a, _WIDE), cv2.blur(b, _WIDE)
+    variance = np.maximum(cv2.blur(a * a, _WIDE) - mean_a**2, np.float32(1e-3))
+    other = np.maximum(cv2.blur(b * b, _WIDE) - mean_b**2, np.float32(1e-3))
+    shared = cv2.blur(a * b, _WIDE) - mean_a * mean_b
+    noise = _noise(noise_grey**2, (variance + other) / 2 - shared, lying)
     expected = 1 - np.float32(noise) / variance
     texture, least = _FOREIGN
     differs: NDArray[np.bool_] = shared < least * expected * np.sqrt(variance * other)
     return differs & (expected > texture)
+
+
+def _noise(least: float, differs: NDArray[np.float32], lying: NDArray[np.bool_]) -> float:
+    """Return what images differ by where what is matched lies on the floor (R, W), in the median:
+    noise, blur and rows that are not quite the same; at least what is known without.
+    """
+    is_enough = np.count_nonzero(lying) > _WIDE[0] * _WIDE[1]
+    return max(least, float(np.median(differs[lying]))) if is_enough else least
 
 
 def _local_difference(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:

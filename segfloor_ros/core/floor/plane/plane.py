@@ -359,9 +359,10 @@ def expectations(mount: Mount, T_map_base: Array | None) -> Array:
     if T_map_base is None:
         return mounted[None]
     T_map_left = T_map_base @ mount.T_base_left
-    # A height that nothing can have is none.
+    # A height that nothing can have is none, and a base that lies on its back sees no floor.
     heights_m = np.maximum((mount.height_m, T_map_left[2, 3]), HEIGHT_RANGE_M[0])
-    return np.stack([mounted, *angles_height_of(T_map_left[2, :3] / heights_m[:, None])])
+    of_map = angles_height_of(T_map_left[2, :3] / heights_m[:, None])
+    return np.vstack([mounted, of_map[np.abs(of_map[:, 1]) < math.pi / 2]])
 
 
 def plane_of_frame(
@@ -446,8 +447,8 @@ def _likeliest(samples: Samples, prior: FramePrior) -> Array:
     raised[:, 2] = 1.0
     depth_m = samples.disparity_m / samples.disparity_px[on]
     raised[:, 2] = -depth_m * (plane_of(raised) * samples.rays[on]).sum(axis=1)
-    guesses, few = np.vstack([prior.means, drawn]), samples.every(int(_CORRELATED_SAMPLES))
-    guesses = guesses[plausible(guesses)]
+    guesses = np.vstack([prior.means, drawn[plausible(drawn)]])
+    few = samples.every(int(_CORRELATED_SAMPLES))
     return np.asarray(guesses[np.argmax(prior.log_posterior(few, guesses))])
 
 

@@ -97,7 +97,9 @@ class LoopDetector:
         if by_look is None:
             found = self._from_above(keyframe, ~near, reach_m)
         else:  # what repeats itself fits where the path has the keyframe, too
-            here = self._matcher.at(keyframe, images, keyframe.T_camera_world, ~near & shown, near)
+            here = self._matcher.at(
+                keyframe, images, keyframe.T_camera_world, ~near & shown, near, is_rough=True
+            )
             found = [by_look, here] if here else [by_look]
 
         def travel(match: Match) -> float:
@@ -202,7 +204,8 @@ class PlaceMatcher:
             again = self.at(keyframe, images, pose, may_show, near)
             if again is not None:
                 return again
-        own_ids, is_bounded = self._own(near), self._known is self._map
+        own_ids = self._known.points_of(np.flatnonzero(near))
+        is_bounded = self._known is self._map
         features = features_of(self._map, keyframe)
         track = self._places.find(images, features, may_show, own_ids, is_bounded=is_bounded)
         return None if track is None else self._match(keyframe, track, may_show)
@@ -214,18 +217,19 @@ class PlaceMatcher:
         T_camera_world: Array,
         may_show: NDArray[np.bool_],
         near: NDArray[np.bool_],
+        is_rough: bool = False,
     ) -> Match | None:
-        """Look for the place at a pose (4, 4) alone. may_show, near: as in `look`."""
+        """Look for the place at a pose (4, 4) alone, or, where it is rough, around it. may_show,
+        near: as in `look`.
+        """
         depth_m = median_depth_m(self._map, keyframe.seen_ids, keyframe.T_camera_world)
         around = views_near(self._known, T_camera_world, depth_m, len(may_show))
-        ids = self._places.points_of(around[may_show[around]][:NEIGHBOURS], self._own(near))
+        own_ids = self._known.points_of(np.flatnonzero(near))
+        ids = self._places.points_of(around[may_show[around]][:NEIGHBOURS], own_ids)
         features = features_of(self._map, keyframe)
-        track = self._places.confirm(images, features, ids, T_camera_world)
+        find = self._places.locate if is_rough else self._places.confirm
+        track = find(images, features, ids, T_camera_world)
         return None if track is None else self._match(keyframe, track, may_show)
-
-    def _own(self, near: NDArray[np.bool_]) -> NDArray[np.int32]:
-        """Return the points that a view sees itself."""
-        return self._known.points_of(np.flatnonzero(near))
 
     def _match(self, keyframe: KeyframeRecord, track: Track, may_show: NDArray[np.bool_]) -> Match:
         """Return what a keyframe sees again where it was tracked in the known map."""

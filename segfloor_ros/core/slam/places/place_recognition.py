@@ -176,9 +176,13 @@ class PlaceRecognition:
         ids = self._map.points_of(keyframes)
         return ids[~np.isin(ids, own_ids)]
 
-    def locate(self, images: Pixels, features: Features, ids: NDArray[np.int32]) -> Track | None:
-        """Find a camera among points `ids` (N,); None unless it sees them."""
-        estimate = self._tracker.locate(features, ids)
+    def locate(
+        self, images: Pixels, features: Features, ids: NDArray[np.int32], near: Array | None = None
+    ) -> Track | None:
+        """Find a camera among points `ids` (N,); None unless it sees them. near: the pose (4, 4)
+        that it is roughly at.
+        """
+        estimate = self._tracker.locate(features, ids, near)
         if estimate is None:
             return None
         return self.confirm(images, features, ids, estimate.T_camera_world)

@@ -171,11 +171,14 @@ class Tracker:
             ),
         )
 
-    def locate(self, features: Features, ids: NDArray[np.int32]) -> PoseEstimate | None:
-        """Find the pose among map points without a prediction: descriptors alone and PnP-RANSAC for
-        a first guess, which then has to find more points where they should be.
+    def locate(
+        self, features: Features, ids: NDArray[np.int32], near: Array | None = None
+    ) -> PoseEstimate | None:
+        """Find the pose among map points, roughly at a pose (4, 4), or without a prediction:
+        descriptors alone and PnP-RANSAC for a first guess, which then has to find more points where
+        they should be.
         """
-        start = self.by_descriptors(features, ids)
+        start = self.by_descriptors(features, ids) if near is None else Start(near, WIDE_PX)
         return None if start is None else self._coarse(features, ids, start)
 
     def by_descriptors(self, features: Features, ids: NDArray[np.int32]) -> Start | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import threading
 from dataclasses import replace
 
@@ -272,22 +273,33 @@ def test_two_places_that_look_alike_are_none_unless_drift_bounds_where_the_camer
     assert (track is not None) is is_bounded
 
 
-def test_a_place_that_fits_as_well_where_the_path_has_the_camera_is_no_loop(closed, monkeypatch):
+@pytest.mark.parametrize(('drift_m', 'verdict'), [(0.0, 'no drift'), (0.1, 'seen')])
+def test_a_place_that_fits_as_well_near_where_the_path_has_the_camera_is_the_likelier_one(
+    closed, monkeypatch, drift_m, verdict
+):
     """What repeats itself fits some steps farther on, too."""
     slam, _ = closed
-    loops, keyframe = slam.back_end.loops, slam.map.keyframes[-1]
-    latest = np.arange(len(slam.map.keyframes)) > keyframe.index - 5
+    loops, last = slam.back_end.loops, slam.map.keyframes[-1]
+    latest = np.arange(len(slam.map.keyframes)) > last.index - 5
     monkeypatch.setattr(loops, '_linked', lambda _: latest)
     monkeypatch.setattr(
         PlaceMatcher,
         'evidence',
         lambda self, keyframe, match, travel: PlaceEvidence(look=match.log_ratio, travel=travel),
     )
-    pixels, pose = keyframe.observations, keyframe.T_camera_world
-    here = loops._matcher.at(keyframe, pixels, pose, ~latest, latest)
-    step = se3_exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    monkeypatch.setattr(
-        loops._matcher, 'look', lambda *_: replace(here, T_camera_world=step @ pose)
-    )
+    pixels, pose = last.observations, last.T_camera_world
+    found = loops._matcher.at(last, pixels, pose, ~latest, latest)
+    farther = replace(found, T_camera_world=sideways(0.4) @ pose)
+    monkeypatch.setattr(loops._matcher, 'look', lambda *_: farther)
+    keyframe = copy.copy(last)
+    keyframe.T_camera_world = sideways(-drift_m) @ pose
     loops.detect(keyframe, pixels)
-    assert loops.candidates[-1].verdict == 'no drift'
+    candidate = loops.candidates[-1]
+    assert candidate.verdict == verdict
+    place = slam.map.keyframes[candidate.place]
+    off = candidate.T_keyframe_place @ place.T_camera_world @ invert(pose)
+    assert np.linalg.norm(off[:3, 3]) < 0.03
+
+
+def sideways(way_m):
+    return se3_exp(np.array([way_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
