@@ -222,10 +222,13 @@ class PlaceMatcher:
         """Look for the place at a pose (4, 4) alone, or, where it is rough, around it. may_show,
         near: as in `look`.
         """
-        depth_m = median_depth_m(self._map, keyframe.seen_ids, keyframe.T_camera_world)
-        around = views_near(self._known, T_camera_world, depth_m, len(may_show))
+        around = np.flatnonzero(may_show)
+        if not is_rough:
+            depth_m = median_depth_m(self._map, keyframe.seen_ids, keyframe.T_camera_world)
+            around = views_near(self._known, T_camera_world, depth_m, len(may_show))
+            around = around[may_show[around]][:NEIGHBOURS]
         own_ids = self._known.points_of(np.flatnonzero(near))
-        ids = self._places.points_of(around[may_show[around]][:NEIGHBOURS], own_ids)
+        ids = self._places.points_of(around, own_ids)
         features = features_of(self._map, keyframe)
         find = self._places.locate if is_rough else self._places.confirm
         track = find(images, features, ids, T_camera_world)
