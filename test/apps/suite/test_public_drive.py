@@ -36,7 +36,9 @@ class Archives(SimpleHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Send the part that is asked for."""
-        content = Path(self.translate_path(self.path)).read_bytes()
+        if not (path := Path(self.translate_path(self.path))).is_file():
+            return self.send_error(404)
+        content = path.read_bytes()
         first, _, last = self.headers['Range'].removeprefix('bytes=').partition('-')
         part = content[int(first) : int(last) + 1]
         self.send_response(206)
@@ -190,7 +192,9 @@ def test_a_file_that_appears_meanwhile_stays(archives, tmp_path) -> None:
         if count == 3:
             mine.write_text('mine')
 
-    with pytest.raises(InputError, match=r'0000000001\.png: cannot be written \(File exists\)') as no:
+    with pytest.raises(
+        InputError, match=r'0000000001\.png: cannot be written \(File exists\)'
+    ) as no:
         fetched(tmp_path, appear)
     assert 'http' not in str(no.value)
     assert mine.read_text() == 'mine'
