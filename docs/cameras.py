@@ -31,7 +31,7 @@ RENDERED = {
 
 
 def rendered(scene: str, kind: str, along: float) -> NDArray[np.uint8]:
-    """Return the left and the right image of a frame, or image and depth, one beside the other."""
+    """Return the left and the right image of a frame, or image and depth, side by side."""
     with Simulation(open_scene(scene, [f'camera.kind={kind}'] if kind else [])) as simulation:
         frame = simulation.frame(int(along * simulation.frame_count))
     if frame.depth_mm is None:

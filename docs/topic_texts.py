@@ -114,7 +114,8 @@ ABOUT = {
     'obstacle_points': (
         'Obstacle points of the newest keyframe with two neighbours within a cell, since the map '
         'may lack them: x y z id. Published while subscribed to: at every keyframe, again for '
-        'each new subscriber, and empty twice a second in between. In a loaded map, its points.'
+        'each new subscriber, and empty twice a second in between while the camera is tracked. In '
+        'a loaded map, its points until the first keyframe.'
     ),
     'keyframe/done': (
         'The header of every keyframe that goes no further: it is in the map, or a node could not '

@@ -27,8 +27,8 @@ ARGUMENTS = {
     'rviz': ('false', 'Show the map in RViz: true or false.'),
     'left_camera_info': (
         '',
-        'Advanced. Topic of the calibration of the left camera, by default camera_info beside its '
-        'images.',
+        'Advanced. Topic of the calibration of the left camera, by default camera_info next to its '
+        'images, or left/camera_info where left and right images have one folder.',
     ),
     'right_camera_info': ('', 'Advanced. Topic of the calibration of the right camera, likewise.'),
     'depth': ('', 'Advanced. Topic of depth images, by default depth/image_raw.'),

@@ -12,6 +12,7 @@ from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'segfloor_ros'
 STAGES = ('stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid')
+SIDES = {'left': 'left_camera_info', 'right': 'right_camera_info'}
 YES, NO = ('true', '1', 'yes', 'on'), ('false', '0', 'no', 'off')
 
 CAMERAS = {
@@ -97,8 +98,8 @@ ARGUMENTS = {
     'rviz': ('false', 'Show the map in RViz: true or false.'),
     'left_camera_info': (
         '',
-        'Advanced. Topic of the calibration of the left camera, by default camera_info beside its '
-        'images.',
+        'Advanced. Topic of the calibration of the left camera, by default camera_info next to its '
+        'images, or left/camera_info where left and right images have one folder.',
     ),
     'right_camera_info': ('', 'Advanced. Topic of the calibration of the right camera, likewise.'),
     'depth': ('', 'Advanced. Topic of depth images, by default depth/image_raw.'),
@@ -236,7 +237,7 @@ def remapped_topics(
     camera: str, context: LaunchContext
 ) -> tuple[list[tuple[str, str]], tuple[str, ...]]:
     """Return the remappings of the inputs, and the parameter that says which images they are: those
-    with rect in their name are taken for rectified.
+    with rect in their name are taken for rectified. Raises ValueError.
     """
     preset, found = CAMERAS.get(camera, {}), []
     kind: tuple[str, ...] = ()
@@ -244,15 +245,19 @@ def remapped_topics(
     def topic(argument: str) -> str:
         return LaunchConfiguration(argument).perform(context) or preset.get(argument, '')
 
-    for side, calibration in (('left', 'left_camera_info'), ('right', 'right_camera_info')):
-        image = topic(f'{side}_image').removesuffix('/compressed')
+    images = {side: topic(f'{side}_image').removesuffix('/compressed') for side in SIDES}
+    folders = [PurePosixPath(image).parent for image in images.values() if image]
+    for side, image in images.items():
         if image:
+            if not PurePosixPath(image).name:
+                raise ValueError(f'{side}_image:={image}: expected the name of a topic')
             kind_name = 'rect' if 'rect' in image else 'raw'
             name = f'{side}/image_{kind_name}'
             found += [(name, image), (f'{name}/compressed', f'{image}/compressed')]
             kind = ('-p', f'image_kind:={kind_name}')
-        beside = str(PurePosixPath(image).with_name('camera_info')) if image else ''
-        info = topic(calibration) or beside
+        info = topic(SIDES[side])
+        if image and not info and len(set(folders)) == len(folders):
+            info = str(PurePosixPath(image).with_name('camera_info'))
         found += [(f'{side}/camera_info', info)] if info else []
     found += [(name, topic(argument)) for argument, name in INPUTS.items() if topic(argument)]
     return found, kind

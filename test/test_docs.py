@@ -150,9 +150,9 @@ def test_each_camera_has_a_picture_and_a_launch_line() -> None:
     launch = (DOCS.parent / 'launch_configs' / 'segfloor.launch.py').read_text()
     cameras = launch.partition('CAMERAS = {')[2].partition('\n}\n')[0]
     known = set(re.findall(r"^    '(\w+)': {$", cameras, re.MULTILINE))
-    assert set(re.findall(r'camera:=(\w+)', page)) <= known
-    stereo = {name for name in known if not name.endswith('_depth')}
-    assert stereo <= set(re.findall(r'\w+', page))
+    assert set(re.findall(r'camera:=(\w+)', page)) == known
+    with_depth = {f'camera_{name}.yaml' for name in known if name.endswith('_depth')}
+    assert with_depth <= set(re.findall(r'\]\(\.\./params/([\w.]+)\)', page))
     for section in page.split('\n## ')[1:]:
         is_other = section.startswith('Any other')
         assert '```sh\n' in section and ('](images/cameras/' in section or is_other), section

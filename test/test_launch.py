@@ -222,6 +222,35 @@ def test_topics_are_arguments(launched) -> None:
 
 
 @pytest.mark.parametrize(
+    ('left', 'right', 'left_info', 'right_info'),
+    [
+        ('/cam/left_image', '/cam/right_image', None, None),
+        ('left_image', 'right_image', None, None),
+        ('/cam/left_image/compressed', '/cam/right_image/compressed', None, None),
+        ('/cam/l/image', '/cam/r/image', '/cam/l/camera_info', '/cam/r/camera_info'),
+        ('/cam/image', '/cam/right/image', '/cam/camera_info', '/cam/right/camera_info'),
+        ('/cam/color/image', '', '/cam/color/camera_info', None),
+        ('image', '', 'camera_info', None),
+    ],
+)
+def test_no_calibration_is_taken_for_both_cameras(
+    launched, left, right, left_info, right_info
+) -> None:
+    found = remappings(launched(left_image=left, right_image=right)['stereo_slam'])
+    assert found['left/image_raw'] == left.removesuffix('/compressed')
+    assert (found.get('left/camera_info'), found.get('right/camera_info')) == (
+        left_info,
+        right_info,
+    )
+
+
+@pytest.mark.parametrize('topic', ['/', '//', '.'])
+def test_an_image_without_a_name_is_refused(launched, topic) -> None:
+    with pytest.raises(ValueError, match=r'right_image:=.*: expected the name of a topic'):
+        launched(left_image='/cam/left/image', right_image=topic)
+
+
+@pytest.mark.parametrize(
     ('camera', 'left', 'kind'),
     [
         ('realsense', '/camera/camera/infra1/image_rect_raw', 'rect'),

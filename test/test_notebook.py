@@ -22,6 +22,17 @@ def test_the_notebook_holds_no_results_of_an_earlier_run() -> None:
     assert all(not cell['outputs'] and cell['execution_count'] is None for cell in cells('code'))
 
 
+def test_a_map_without_a_height_of_the_camera_is_told(tmp_path, capsys) -> None:
+    (cell,) = (c for c in cells('code') if 'camera_height_m' in ''.join(c['source']))
+    for height_m in (None, 0.4):
+        values = {'tracked_frames': 1, 'frames': 1, 'keyframes': 1, 'camera_height_m': height_m}
+        (tmp_path / 'summary.json').write_text(json.dumps(values))
+        exec(''.join(cell['source']), {'json': json, 'OUT': tmp_path})
+    assert capsys.readouterr().out.splitlines()[1::2] == [
+        'camera height unknown', 'camera 0.400 m above the floor',
+    ]  # fmt: skip
+
+
 @pytest.mark.slow
 def test_the_cells_run_and_show_the_map_that_is_written(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)

@@ -370,7 +370,7 @@ def path_table(rows: Sequence[PathRow]) -> Table:
 
 
 def slam_rich(rows: Sequence[SlamRow]) -> Table:
-    """Return the paths of other programs beside ours, drive by drive."""
+    """Return the paths of other programs next to ours, drive by drive."""
     heads, *lines = slam_cells(rows)
     table = figure_table(*heads)
     for cells in lines:

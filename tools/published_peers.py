@@ -1,4 +1,4 @@
-"""The path alone, ours beside that of programs built from their published sources: RTAB-Map,
+"""The path alone, ours and that of programs built from their published sources: RTAB-Map,
 stella_vslam, ORB-SLAM2 and ORB-SLAM3, each on a rectified recording in the layout of KITTI.
 
 A folder has runners for some of them: `bin/rtabgrid slam DIR`, `bin/stella_kitti VOCABULARY DIR`,

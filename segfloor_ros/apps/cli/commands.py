@@ -198,9 +198,10 @@ def demo(
             '--real', help='Map a car on a road instead: 51 public pairs of KITTI, 30 MB to fetch.'
         ),
     ] = False,
-    data: Annotated[Path, typer.Option(help='Folder of what --real fetches.')] = Path(
-        'segfloor_kitti'
-    ),
+    data: Annotated[
+        Path | None,
+        typer.Option(help='Folder of what --real fetches.', show_default='segfloor_kitti'),
+    ] = None,
     as_json: terminal.Json = False,
 ) -> None:
     """Map a recorded drive through a corridor with the five nodes and score the map.
@@ -210,6 +211,10 @@ def demo(
     segfloor demo --lockstep --out demo
     segfloor demo --real --out road
     """
+    if data is not None and not real:
+        raise SettingsError('--data: only --real fetches something; add it, or leave --data out')
+    StereoCameraNodeSettings(rate=rate)  # refuses an impossible rate
+    data = data or Path('segfloor_kitti')
     with terminal.json_alone(as_json):
         scores = _real_demo(out, rate, lockstep, data) if real else _demo(out, rate, lockstep)
     if as_json:
@@ -235,11 +240,12 @@ def _real_demo(out: Path, rate: float, lockstep: bool, data: Path) -> dict[str, 
     # Imported here: fsspec is an extra.
     from segfloor_ros.apps.suite import public_drive
 
-    console.print(public_drive.ABOUT)
+    with OutputFolder(out, [data / public_drive.FOLDER]):
+        console.print(public_drive.ABOUT)  # nothing is fetched for an --out that is refused
     count = sum(map(len, public_drive.files_by_url().values()))
     with terminal.progress_bar('fetching', count) as progress:
         drive = public_drive.fetched(data, progress)
-    options = {'frames': public_drive.PAIRS, 'params': terminal.params_file(Path('kitti'))}
+    options = {'frames': public_drive.PAIRS, 'params': terminal.shipped_params()['kitti']}
     what = 'a car on a road in Karlsruhe'
     _map_demo(what, lockstep, rate, input=str(drive), out=out, report=True, **options)
     return read_json(out / 'summary.json', 'a summary')

@@ -163,13 +163,14 @@ def open_system(url: str) -> tuple[Any, str]:
     """Return the file system of a URL, and the path in it. Raises InputError."""
     try:
         from fsspec.core import url_to_fs
-    except ImportError:
-        raise InputError(
-            f"{url}: URLs need fsspec; install the extra: pip install 'segfloor_ros[cluster]'"
-        ) from None
-    try:
+
         return url_to_fs(url)
-    except (ImportError, OSError, ValueError) as error:
+    except ImportError as error:
+        raise InputError(
+            f'{url}: a library is missing ({error}); those of https:// come with '
+            "pip install 'segfloor_ros[cluster]'"
+        ) from None
+    except (OSError, ValueError) as error:
         raise InputError(f'{url}: cannot be read ({error})') from None
 
 

@@ -163,7 +163,7 @@ def check_target(
     _check_kind(target)
     place = target.resolve()
     for one in inputs:
-        if one and os.path.exists(one):
+        if one and (isinstance(one, Path) or os.path.exists(one)):
             read = Path(one).resolve()
             if place == read or place in read.parents or read in place.parents:
                 raise InputError(

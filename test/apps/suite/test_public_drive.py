@@ -1,6 +1,7 @@
 """The public drive of `segfloor demo --real`, fetched from a server on this machine."""
 
 import json
+import sys
 import zipfile
 from collections.abc import Iterator
 from functools import partial
@@ -19,6 +20,7 @@ from segfloor_ros.apps.suite.public_drive import fetched
 from segfloor_ros.core.errors import InputError
 
 pytest.importorskip('aiohttp', reason='URLs need the extra cluster')
+registry = pytest.importorskip('fsspec.registry')
 
 PAIRS = 6
 
@@ -34,7 +36,9 @@ class Archives(SimpleHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Send the part that is asked for."""
-        content = Path(self.translate_path(self.path)).read_bytes()
+        if not (path := Path(self.translate_path(self.path))).is_file():
+            return self.send_error(404)
+        content = path.read_bytes()
         first, _, last = self.headers['Range'].removeprefix('bytes=').partition('-')
         part = content[int(first) : int(last) + 1]
         self.send_response(206)
@@ -143,7 +147,9 @@ def test_without_network_one_line_says_what_to_do(tmp_path, monkeypatch) -> None
     failed = segfloor('demo', '--real', '--data', tmp_path / 'k', '--out', tmp_path / 'o')
     assert failed.returncode == 2
     (line,) = failed.stderr.strip().splitlines()
-    assert 'http://127.0.0.1:9/2011_09_30_calib.zip: cannot be read' in line
+    assert 'http://127.0.0.1:9/2011_09_30_calib.zip: cannot be read (Cannot connect to host' in line
+    assert 'not found' not in line
+    assert 'is kept' not in line, 'nothing came'
     assert all(url in line for url in public_drive.files_by_url())
     assert line.endswith(f'by other means and unpack both in {tmp_path}/k')
     assert not (tmp_path / 'o').exists()
@@ -152,7 +158,13 @@ def test_without_network_one_line_says_what_to_do(tmp_path, monkeypatch) -> None
 def test_an_archive_that_is_gone_is_named(archives, tmp_path) -> None:
     (path,) = archives.rglob('*_calib.zip')
     path.unlink()
-    with pytest.raises(InputError, match=r'_calib\.zip: cannot be read \(not found\);'):
+    with pytest.raises(InputError, match=r'_calib\.zip: cannot be read \(not found\); try again'):
+        fetched(tmp_path)
+
+
+def test_a_server_that_has_no_address_is_not_called_a_missing_file(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(public_drive, 'ARCHIVES', 'http://nowhere.invalid')
+    with pytest.raises(InputError, match=r'cannot be read \(Cannot connect to host nowhere\.inv'):
         fetched(tmp_path)
 
 
@@ -162,3 +174,87 @@ def test_a_file_that_is_there_stays(archives, tmp_path) -> None:
     mine.write_text('mine')
     fetched(tmp_path)
     assert mine.read_text() == 'mine'
+
+
+def test_a_link_to_nothing_stays(archives, tmp_path) -> None:
+    mine = tmp_path / public_drive.FOLDER / 'image_00' / 'data' / '0000000001.png'
+    mine.parent.mkdir(parents=True)
+    mine.symlink_to(tmp_path / 'disk' / 'mine.png')
+    fetched(tmp_path)
+    assert mine.is_symlink()
+    assert not mine.exists()
+
+
+def test_a_file_that_appears_meanwhile_stays(archives, tmp_path) -> None:
+    mine = tmp_path / public_drive.FOLDER / 'image_00' / 'data' / '0000000001.png'
+
+    def appear(count: int) -> None:
+        if count == 3:
+            mine.write_text('mine')
+
+    with pytest.raises(
+        InputError, match=r'0000000001\.png: cannot be written \(File exists\)'
+    ) as no:
+        fetched(tmp_path, appear)
+    assert 'http' not in str(no.value)
+    assert mine.read_text() == 'mine'
+    assert not list(tmp_path.glob('.segfloor-*'))
+
+
+def test_a_folder_that_cannot_be_written_does_not_blame_the_server(archives, tmp_path) -> None:
+    (tmp_path / public_drive.DAY).write_text('mine')
+    with pytest.raises(InputError, match=rf'^{tmp_path}/.*: cannot be written \(.*--data$') as no:
+        fetched(tmp_path)
+    assert 'http' not in str(no.value)
+
+
+def test_both_sides_have_their_own_images(archives, tmp_path) -> None:
+    drive = fetched(tmp_path)
+    (path,) = archives.rglob('*_sync.zip')
+    with zipfile.ZipFile(path) as archive:
+        for file in drive.rglob('*.png'):
+            assert file.read_bytes() == archive.read(str(file.relative_to(tmp_path)))
+
+
+def test_a_folder_named_kitti_is_not_taken_for_parameters(archives, tmp_path, monkeypatch) -> None:
+    (tmp_path / 'kitti').mkdir()
+    monkeypatch.chdir(tmp_path)
+    made = segfloor('demo', '--real', '--lockstep', '--out', 'o')
+    assert made.returncode == 0, made.stderr
+    assert images_in(tmp_path / 'segfloor_kitti') == 2 * PAIRS
+
+
+@pytest.mark.parametrize(
+    ('options', 'complaint'),
+    [
+        (('--real', '--out', 'full'), 'full: holds files'),
+        (('--real', '--out', '.'), '.: is, holds or lies in segfloor_kitti/2011'),
+        (('--real', '--out', 'new', '--data', 'new'), 'new: is, holds or lies in new/2011'),
+        (('--real', '--out', 'file/o'), 'file/o: cannot be written'),
+        (('--real', '--rate', '-1'), 'rate'),
+        (('--real', '--rate', 'nan'), 'rate'),
+        (('--data', 'k'), '--data: only --real'),
+    ],
+)
+def test_what_cannot_be_done_is_said_before_anything_is_fetched(
+    archives, tmp_path, monkeypatch, options, complaint
+) -> None:
+    (tmp_path / 'full').mkdir()
+    (tmp_path / 'full' / 'mine').touch()
+    (tmp_path / 'file').touch()
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    refused = segfloor('demo', *options)
+    (line,) = refused.stderr.strip().splitlines()
+    assert refused.returncode == 2
+    assert complaint in line
+    assert (Archives.sent, sorted(tmp_path.iterdir())) == (0, before)
+
+
+def test_a_library_that_is_missing_is_named_with_its_extra(tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, 'aiohttp', None)
+    monkeypatch.delitem(sys.modules, 'fsspec.implementations.http', raising=False)
+    monkeypatch.delitem(registry._registry, 'http', raising=False)
+    monkeypatch.setattr(public_drive, 'ARCHIVES', 'http://127.0.0.1:9')
+    with pytest.raises(InputError, match=r"aiohttp.*pip install 'segfloor_ros\[cluster\]'$"):
+        fetched(tmp_path)
