@@ -64,6 +64,8 @@ def test_an_input_is_no_place_for_results(tmp_path):
         with pytest.raises(InputError, match=r'is, holds or lies in .*drive, which is read'):
             check_target(out, [], [recording])
     check_target(tmp_path / 'data' / 'out', [], ['', 's3://bucket/drive', recording])
+    with pytest.raises(InputError, match='which is read'):  # though it is not there yet
+        check_target(tmp_path / 'new', [], [tmp_path / 'new' / 'drive'])
 
 
 def test_a_scratch_folder_is_private_and_goes(tmp_path):
