@@ -153,9 +153,9 @@ class Reporter:
         """Warn about sets that were given up, naming the topics of the missing parts; those of
         which only the latest counts are nothing.
         """
-        kind = TOPICS[joiner.parts[0]]
+        is_passing = all(TOPICS[name].profile is FRAMES for name in joiner.parts)
         for dropped in joiner.take_dropped():
-            if kind.profile is FRAMES:
+            if is_passing:
                 continue
             names = ', '.join(dropped.missing)
             crowded = ''.join(
@@ -166,12 +166,9 @@ class Reporter:
             text = f'no message on {names} with stamp {dropped.stamp_ns}; dropped{crowded}'
             self.health.count('dropped')
             # Others may still be starting; a second publisher is wrong from the first moment.
-            is_late = bool(crowded) or time.monotonic() - self._opened_s >= PATIENCE_S
-            if is_late:
+            if crowded or time.monotonic() - self._opened_s >= PATIENCE_S:
                 self.diagnose(f'parts {names}{crowded}', text, lasts_s=PATIENCE_S)
-            # Of the oldest that publishers keep for a node that starts, parts are gone.
-            level = Level.ERROR if is_late or kind.offered is kind.profile else Level.WARN
-            self.report(dropped.stamp_ns, level, text)
+            self.report(dropped.stamp_ns, Level.ERROR, text)
 
     def diagnose(
         self,
