@@ -241,7 +241,7 @@ def _long_table(figures: dict[str, Any]) -> str:
             bare.append(f'{row[0]} ({row[1]})')
         else:
             rows.append(row)
-    return _table(heads, rows) + f'\nWithout truth: {"; ".join(bare)}.\n'
+    return _table(heads, rows) + f'\nWithout a true path: {"; ".join(bare)}.\n'
 
 
 def _published_table(figures: dict[str, Any]) -> str:
