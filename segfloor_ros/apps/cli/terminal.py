@@ -321,9 +321,8 @@ class DriveOptions(InputOptions):
 
     @property
     def inputs(self) -> tuple[Path | str | None, ...]:
-        """All files and folders that are read; parameters may be a name instead."""
-        params = self.params if self.params and self.params.exists() else None
-        return self.input, self.masks, self.load_map, self.network, params
+        """All files and folders that are read."""
+        return self.input, self.masks, self.load_map, self.network, self.params
 
     @property
     def maps(self) -> MapOptions:

@@ -11,10 +11,9 @@ from rich.text import Text
 
 from segfloor_ros.apps.cli.help_panels import ADVANCED, BASIC, lay_out
 from segfloor_ros.apps.cli.main import COMMANDS, program
-from segfloor_ros.apps.cli.terminal import DriveOptions, params_file, shipped_params
+from segfloor_ros.apps.cli.terminal import params_file, shipped_params
 from segfloor_ros.apps.simulation.scene_file import open_scene, shipped
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.files.writing import check_target
 from segfloor_ros.nodes.configuration import resolve
 
 
@@ -94,8 +93,6 @@ def test_shipped_parameters_are_found_by_name(tmp_path, monkeypatch):
     done = segfloor('run', 'nothing', '--params', 'kitti', '--out', 'out')
     assert 'nothing' in done.stderr
     assert '--params' not in done.stderr
-    options = DriveOptions(input='nothing', params=Path('kitti'))
-    check_target(Path('kitti'), ['map.yaml'], options.inputs)
 
 
 def test_a_file_of_ones_own_wins_over_a_shipped_name(tmp_path, monkeypatch):
