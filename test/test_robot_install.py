@@ -93,6 +93,7 @@ WORDS = {
     'info': ('DRIVE',),
     'run': ('DRIVE', '--out', 'result', '--report'),
     'convert': ('DRIVE', 'drive.mcap'),
+    'demo': ('--real', '--out', 'real'),
     'record': ('drive.mcap', '--seconds', '1'),
     'calibrate': ('--check', 'DRIVE'),
     'benchmark': ('DRIVE', '--frames', '4'),
