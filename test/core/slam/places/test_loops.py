@@ -65,7 +65,7 @@ def drive(drift):
 
 @pytest.fixture(scope='module')
 def closed():
-    return drive(np.array([0.25, 0.0, 0.1, 0.0, 0.03, 0.0]))
+    return drive(np.array([0.3, 0.0, 0.1, 0.0, 0.03, 0.0]))
 
 
 def test_a_drift_is_found_and_taken_away(closed):
@@ -79,7 +79,7 @@ def test_a_drift_is_found_and_taken_away(closed):
 
 def test_a_loop_that_contradicts_the_map_is_not_noted_as_closed(monkeypatch):
     monkeypatch.setattr(back_end, 'apply_closing', lambda *_: False)
-    slam, _ = drive(np.array([0.25, 0.0, 0.1, 0.0, 0.03, 0.0]))
+    slam, _ = drive(np.array([0.3, 0.0, 0.1, 0.0, 0.03, 0.0]))
     verdicts = {candidate.verdict for candidate in slam.back_end.loops.candidates}
     assert 'contradicts the map' in verdicts
     assert 'closed' not in verdicts
