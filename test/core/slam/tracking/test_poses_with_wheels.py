@@ -57,11 +57,11 @@ def driven(frames, wheels):
 
 @pytest.fixture(scope='module')
 def on_wheels(frames):
-    """Wheels that err by 3 mm per root metre go 2 % too far, which is less than that."""
+    """Wheels that err by 3 mm per root metre go 1 % too far, which is less than that."""
     poses = [base_at(k / 5) for k in range(5 * FRAMES + 5)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(body_motion, 'SIGMA_ROOT_M', 0.003)
-        return driven(frames, [make_transform(T[:3, :3], 1.02 * T[:3, 3]) for T in poses])
+        return driven(frames, [make_transform(T[:3, :3], 1.01 * T[:3, 3]) for T in poses])
 
 
 @pytest.fixture(scope='module')
@@ -77,8 +77,5 @@ def test_the_offset_of_the_rig_pulls_no_pose(on_wheels, alone):
 
 
 def test_sensors_learn_from_what_the_images_alone_show(on_wheels, alone):
-    moved_m = np.abs(on_wheels[0][1:] - alone[0][1:])[:, :3, 3].max()
-    assert moved_m > 1e-4
-    np.testing.assert_allclose(on_wheels[1][:2], alone[1][:2], atol=2e-5)
-    # The map, which the wheels move a little, shows later frames elsewhere.
-    np.testing.assert_allclose(on_wheels[1], alone[1], atol=moved_m / 20)
+    np.testing.assert_allclose(on_wheels[1], alone[1], atol=2e-5)
+    assert np.abs(on_wheels[0][1:] - alone[0][1:])[:, :3, 3].max() > 1e-4
