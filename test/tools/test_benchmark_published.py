@@ -41,6 +41,10 @@ def test_an_unknown_scene_is_refused():
         parse_scenes('corridor1,coridor2', SCENES)
 
 
+def test_recordings_alone_need_no_scene():
+    assert parse_scenes('', SCENES) == []
+
+
 def test_the_published_scenes_are_shipped_and_their_rows_name_a_page():
     assert set(SCENES) == {*PUBLISHED, *DRIVES} <= set(shipped())
     for name, scene in PUBLISHED.items():
