@@ -19,6 +19,7 @@ from segfloor_ros.nodes.shared.joining import StampJoiner
 from segfloor_ros.nodes.shared.reporter import LossCounter, loss_in_words, loss_level
 from segfloor_ros.nodes.slam_camera import PairQueue
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
+from segfloor_ros.nodes.watches.camera import CameraWatch
 
 
 def health(graph, node: str):
@@ -150,6 +151,22 @@ def test_frames_that_come_faster_than_they_are_tracked_are_skipped_and_said(
     graph.until(lambda: health(graph, 'stereo_slam')[-1].values['skipped'] == '6', 'the count')
     message = health(graph, 'stereo_slam')[-1].message
     assert re.search(r'left/image_raw comes faster than it is tracked: \d of 10 images', message)
+
+
+@pytest.mark.parametrize(('skipped', 'said'), [(4, None), (20, '8 of 10 images a second')])
+def test_a_rate_is_called_low_where_it_is_and_not_for_a_short_burst(make_graph, skipped, said):
+    """100 images at 10 Hz, of which the last ones came in a burst."""
+    node = make_graph(*MOUNTED).add(StereoSlamNode())
+    watch = CameraWatch(node)
+    watch.expect('left/image_raw', 'right/image_raw')
+    for number in range(100):
+        watch.saw_image('left/image_raw', stamp_ns := number * 10**8)
+        if number < 100 - skipped:
+            watch.note_taken()
+        else:
+            watch.report_skipped(stamp_ns, is_ready=True)
+    problem = node.reporter.health.problems.get('skipped')
+    assert (problem is None) if said is None else (said in problem.text)
 
 
 def taken_of(arriving: list[int], least: int) -> tuple[list[int], int]:

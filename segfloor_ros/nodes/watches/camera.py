@@ -19,7 +19,7 @@ FIRST_INFO_S = 5.0
 """A driver that starts publishes its calibration by then."""
 
 REMEMBERED = 10 * RECENT
-"""Stamps of images, so that one side may be late."""
+"""Stamps of images, so that one side may be late; and pairs, over which a rate is a rate."""
 
 PLAUSIBLE_ROLL_DEG, PLAUSIBLE_PITCH_DEG = 20.0, 60.0
 """Beyond these a mount that was measured is hard to believe."""
@@ -38,7 +38,7 @@ class CameraWatch:
         """Watch these two topics from now on."""
         self._stamps: dict[str, deque[int]] = {t: deque(maxlen=REMEMBERED) for t in (left, right)}
         self._last_image_s: dict[str, float] = {}
-        self._taken: deque[bool] = deque(maxlen=RECENT)
+        self._taken: deque[bool] = deque(maxlen=REMEMBERED)
         self._is_live = False
 
     def saw_image(self, topic: str, stamp_ns: int) -> None:
@@ -53,8 +53,8 @@ class CameraWatch:
         self._taken.append(True)
 
     def report_skipped(self, stamp_ns: int, is_ready: bool) -> None:
-        """Report a pair that was left out because newer ones had overtaken it. is_ready: tracking
-        has begun.
+        """Report a pair that was left out because newer ones had overtaken it, and say so in the
+        health where that lowers the rate. is_ready: tracking has begun.
         """
         reporter = self._node.reporter
         reporter.health.count('skipped')
@@ -66,14 +66,15 @@ class CameraWatch:
         self._taken.append(False)
         topic, stamps_ns = next(iter(self._stamps.items()))
         rate_hz = (len(stamps_ns) - 1) / max(1e-9 * (stamps_ns[-1] - stamps_ns[0]), 1e-3)
-        reporter.diagnose(
-            'skipped',
-            f'{topic} comes faster than it is tracked: {rate_hz * np.mean(self._taken):.0f} of '
-            f'{rate_hz:.0f} images a second; the others are skipped; lower the rate or the size '
-            'of the images or num_features of stereo_slam, or play a recording with lossless set '
-            'on stereo_camera',
-            lasts_s=PATIENCE_S,
-        )
+        tracked, given = f'{rate_hz * np.mean(self._taken):.0f}', f'{rate_hz:.0f}'
+        if tracked != given:
+            reporter.diagnose(
+                'skipped',
+                f'{topic} comes faster than it is tracked: {tracked} of {given} images a second; '
+                'the others are skipped; lower the rate or the size of the images or num_features '
+                'of stereo_slam, or play a recording with lossless set on stereo_camera',
+                lasts_s=PATIENCE_S,
+            )
 
     def find_problems(self, missing_infos: list[str]) -> None:
         """Diagnose what shows over time. missing_infos: calibrations that images wait for."""
