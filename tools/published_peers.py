@@ -8,7 +8,6 @@ A folder has runners for some of them: `bin/rtabgrid slam DIR`, `bin/stella_kitt
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -28,6 +27,16 @@ RUNNERS = {
     'ORB-SLAM3': ('orb3_kitti', 'vocab/orb3.txt'),
 }
 """Program and first word, by system."""
+
+MEASURE = """
+import resource, subprocess, sys
+status = subprocess.call(sys.argv[1:], stderr=subprocess.STDOUT)
+usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(f'\\n{usage.ru_utime + usage.ru_stime} {usage.ru_maxrss / 1024}')
+sys.exit(min(abs(status), 255))
+"""
+"""Runs a program from a small process: its peak memory begins with that of the process that starts
+it."""
 
 
 @dataclass(frozen=True)
@@ -79,16 +88,15 @@ def run_program(words: Sequence[str | Path | float]) -> tuple[str, float, float]
     """Return what a program said, its CPU time in seconds and its peak memory in MB. Raises
     SegfloorError where it fails.
     """
-    with subprocess.Popen(
-        [str(word) for word in words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as process:
-        assert process.stdout is not None
-        said = process.stdout.read()
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise SegfloorError(f'{words[0]} {words[1]}: status {process.returncode}: {said[-300:]}')
-    return said, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024
+    command = [sys.executable, '-c', MEASURE, *map(str, words)]
+    done = subprocess.run(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
+    )
+    said, _, usage = done.stdout.rstrip().rpartition('\n')
+    if done.returncode:
+        raise SegfloorError(f'{words[0]} {words[1]}: status {done.returncode}: {said[-300:]}')
+    cpu_s, peak_mb = map(float, usage.split())
+    return said, cpu_s, peak_mb
 
 
 def slam_cells(rows: Sequence[SlamRow]) -> list[tuple[str, ...]]:

@@ -31,7 +31,7 @@ from tools.benchmark_published import (
 )
 from tools.published_figures import HEADS, PUBLISHED, Row, page_table, parse_scenes
 from tools.published_paths import DRIVES, PAGE_HEADS, PathRow, paths_table, run_drive
-from tools.published_peers import RUNNERS, SlamRow, run_peers, slam_table
+from tools.published_peers import RUNNERS, SlamRow, run_peers, run_program, slam_table
 
 CONFIGURATION = resolve()
 
@@ -233,6 +233,15 @@ def test_a_scene_is_rendered_once_mapped_and_scored(tmp_path):
     document = json.loads(json.dumps(as_document([first], [first.row])))
     assert document['rows'][0]['scene'] == 'corridor2'
     assert document['published'][0]['system'] == 'Segfloor'
+
+
+def test_the_memory_of_a_program_is_its_own_and_not_that_of_who_starts_it():
+    held = bytearray(400_000_000)
+    said, cpu_s, peak_mb = run_program([sys.executable, '-c', 'a = b"1" * 60_000_000; print(7)'])
+    assert len(held) and said.strip() == '7'
+    assert cpu_s > 0 and 60 < peak_mb < 200
+    with pytest.raises(SegfloorError, match='status 3: it broke'):
+        run_program([sys.executable, '-c', 'print("it broke"); raise SystemExit(3)'])
 
 
 @pytest.mark.slow
