@@ -137,11 +137,11 @@ class FloorSegmentation:
         with measure('likelihood'):
             seen = _seen(frame, mask, self._settings.step_height_m)
             mask, climbed = self.likelihood.weighed(mask, seen)
-            driven = drop_islands(with_floor(mask, climbed))
+            driven = with_floor(mask, climbed)
             if not is_shown:
                 driven[driven == FLOOR] = NO_EVIDENCE
             driven = pair.without_hidden(driven)
-            mask = without_floor(driven, climbed)
+            mask = drop_islands(without_floor(driven, climbed))
         with measure(DISPARITY_ABOVE):
             hanging_xy = self._overhead.positions(pair, view.mount)
         with measure('scan'):

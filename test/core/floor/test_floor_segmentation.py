@@ -403,3 +403,21 @@ def test_what_a_floor_mirrors_is_no_obstacle_and_what_stands_on_it_no_floor(cont
     assert (observation.mask == NOT_FLOOR)[is_floor & (depth < 3.0)].mean() < 0.03
     assert (observation.mask == FLOOR)[~is_floor & np.isfinite(depth)].mean() < 0.001
     assert not (observation.scan.obstacle_m < 1.3).any()
+
+
+@pytest.mark.parametrize('low_m', [0.1, 0.2])
+@pytest.mark.parametrize('is_measured', [False, True])
+def test_what_lies_below_the_floor_is_neither_floor_nor_an_obstacle(low_m, is_measured):
+    """A drop, or what a shiny patch of floor mirrors: of the one no more is known than of the
+    other.
+    """
+    lower = dataclasses.replace(floor_patch(1.2, 3.0, height_m=-low_m), is_floor=False)
+    scene = Scene([floor_patch(far_m=1.2), lower, floor_patch(near_m=3.0), wall(4.0)], SMALL_CAMERA)
+    left, right, floor, depth = scene.render()
+    if is_measured:
+        right = disparity_of_depth(depth.astype(np.float32), SMALL_CAMERA)
+    mask = FloorSegmentation(SMALL_CAMERA, SETTINGS).process(left, right, MOUNT).mask
+    height_m = points_of(scene, depth)[..., 2]
+    fallen = np.isfinite(depth) & (height_m < -low_m / 2)
+    assert (mask[fallen] == NO_EVIDENCE).mean() > 0.95
+    assert (mask == FLOOR)[floor & (depth < 1.2)].mean() > 0.9

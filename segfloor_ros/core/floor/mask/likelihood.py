@@ -224,10 +224,10 @@ class Likelihood:
     def weighed(
         self, mask: NDArray[np.uint8], seen: Seen
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Return a mask (R, W) without floor that is not likely, and with what surely is floor,
-        where that is measured, or carried to what only the left camera sees; and what is
-        none only as it is higher, though no higher than a robot climbs (R, W). What lies too
-        low for a robot is a drop, or what a floor mirrors, and no floor however it looks.
+        """Return a mask (R, W) without floor that is not likely, or too far to be judged, and with
+        what surely is floor, where that is measured, or carried to what only the left camera sees;
+        and what is none only as it is higher, though no higher than a robot climbs (R, W). What
+        lies too low for a robot is a drop, or what a floor mirrors, and no floor however it looks.
         """
         known = known_weight(seen)
         every, is_low = features(seen, known)
@@ -249,7 +249,7 @@ class Likelihood:
         values = np.where(seen.lower, np.float32(-_MOST_NATS), log_ratio)
         carried = carry(values, known * counts, seen)
         carried += every[-1] / 2
-        unlikely |= one_sided & (carried < 0)
+        unlikely |= ~near_enough | (one_sided & (carried < 0))
         sure |= one_sided & (carried > _SURE)
         sure &= ~unlikely
         found = with_floor(without_floor(mask, enlarged(unlikely, mask)), enlarged(sure, mask))

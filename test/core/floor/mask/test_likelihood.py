@@ -169,7 +169,10 @@ def test_a_mask_changes_only_where_something_is_measured(size: tuple[int, int]) 
     assert np.all(changed[between] == NO_EVIDENCE)
     assert np.all(changed[:, -size[1] // 4 :] == NOT_FLOOR)
     far = dataclasses.replace(seen, floor_px=np.full(SHAPE, 2, np.float32))
-    np.testing.assert_array_equal(surely.weighed(mask, far)[0], mask)
+    # What is too far to be judged is no floor, whatever was filled.
+    np.testing.assert_array_equal(
+        surely.weighed(mask, far)[0], np.where(mask == FLOOR, NO_EVIDENCE, mask)
+    )
     unsure = Likelihood([0.5, *5 * [0.0]])
     np.testing.assert_array_equal(unsure.weighed(mask, seen)[0], mask)
     drop = dataclasses.replace(seen, lower=np.ones(SHAPE, bool))
