@@ -133,8 +133,8 @@ RTAB-Map's memory is said to grow 71.62 times as fast.
 
 
 def parse_scenes(text: str, known: Sequence[str]) -> list[str]:
-    """Return the names in `corridor1,corridor2`, none of an empty text. Raises SettingsError for one
-    that is not known.
+    """Return the names in `corridor1,corridor2`; an empty text has none. Raises SettingsError for
+    one that is not known.
     """
     names = [part.strip() for part in text.split(',') if part.strip()]
     for name in names:
