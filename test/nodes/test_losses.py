@@ -153,14 +153,19 @@ def test_frames_that_come_faster_than_they_are_tracked_are_skipped_and_said(
     assert re.search(r'left/image_raw comes faster than it is tracked: \d of 10 images', message)
 
 
-@pytest.mark.parametrize(('skipped', 'said'), [(4, None), (20, '8 of 10 images a second')])
-def test_a_rate_is_called_low_where_it_is_and_not_for_a_short_burst(make_graph, skipped, said):
-    """100 images at 10 Hz, of which the last ones came in a burst."""
+@pytest.mark.parametrize(
+    ('rate_hz', 'skipped', 'said'),
+    [(10, 4, None), (10, 20, '8 of 10 images a second'), (2, 20, '1.6 of 2 images a second')],
+)
+def test_a_rate_is_called_low_where_it_is_and_not_for_a_short_burst(
+    make_graph, rate_hz, skipped, said
+):
+    """100 images, of which the last ones came in a burst."""
     node = make_graph(*MOUNTED).add(StereoSlamNode())
     watch = CameraWatch(node)
     watch.expect('left/image_raw', 'right/image_raw')
     for number in range(100):
-        watch.saw_image('left/image_raw', stamp_ns := number * 10**8)
+        watch.saw_image('left/image_raw', stamp_ns := number * 10**9 // rate_hz)
         if number < 100 - skipped:
             watch.note_taken()
         else:

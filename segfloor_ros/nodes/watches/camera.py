@@ -54,7 +54,7 @@ class CameraWatch:
 
     def report_skipped(self, stamp_ns: int, is_ready: bool) -> None:
         """Report a pair that was left out because newer ones had overtaken it, and say so in the
-        health where that lowers the rate. is_ready: tracking has begun.
+        health where it is more than one in twenty. is_ready: tracking has begun.
         """
         reporter = self._node.reporter
         reporter.health.count('skipped')
@@ -66,13 +66,14 @@ class CameraWatch:
         self._taken.append(False)
         topic, stamps_ns = next(iter(self._stamps.items()))
         rate_hz = (len(stamps_ns) - 1) / max(1e-9 * (stamps_ns[-1] - stamps_ns[0]), 1e-3)
-        tracked, given = f'{rate_hz * np.mean(self._taken):.0f}', f'{rate_hz:.0f}'
-        if tracked != given:
+        share = round(float(np.mean(self._taken)), 1)
+        if share < 1:
             reporter.diagnose(
                 'skipped',
-                f'{topic} comes faster than it is tracked: {tracked} of {given} images a second; '
-                'the others are skipped; lower the rate or the size of the images or num_features '
-                'of stereo_slam, or play a recording with lossless set on stereo_camera',
+                f'{topic} comes faster than it is tracked: {round(share * rate_hz, 1):g} of '
+                f'{round(rate_hz, 1):g} images a second; the others are skipped; lower the rate or '
+                'the size of the images or num_features of stereo_slam, or play a recording with '
+                'lossless set on stereo_camera',
                 lasts_s=PATIENCE_S,
             )
 
