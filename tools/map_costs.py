@@ -31,7 +31,7 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import (
 from segfloor_ros.core.slam.places.loop_closing import optimise, plan_closing
 from segfloor_ros.core.slam.places.loops import path_lengths
 from segfloor_ros.core.slam.places.place_recognition import NUM_WORDS, PlaceRecognition, Vocabulary
-from segfloor_ros.core.slam.rig import NO_OFFSET, Rig
+from segfloor_ros.core.slam.rig import Rig
 from segfloor_ros.core.slam.sparse_map import Match, SparseMap
 from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.patch_alignment import SIDE_PX
@@ -131,7 +131,7 @@ def measure(count: int) -> dict[str, float]:
     own['plan'], closing = once_ms(lambda: plan_closing(sparse_map, [match]))
     own['pose graph'], (poses, _) = once_ms(lambda: optimise(closing.graph))
     own['move'], _ = once_ms(lambda: move_keyframes(sparse_map, poses))
-    own['copy'], adjustment = once_ms(lambda: copy_map(sparse_map, NO_OFFSET, None))
+    own['copy'], adjustment = once_ms(lambda: copy_map(sparse_map, 0.0, None))
     own['global'], result = once_ms(lambda: solve_global(CAMERA, adjustment, lambda: True))
     own['apply'], _ = once_ms(lambda: apply_global(sparse_map, result))
     return own

@@ -62,8 +62,8 @@ class OffsetEstimate:
     information: float
 
 
-NO_OFFSET = OffsetEstimate(0.0, 1e12)
-"""Disparities are certainly true."""
+NO_OFFSET, UNKNOWN_OFFSET = OffsetEstimate(0.0, 1e12), OffsetEstimate(0.0, 0.0)
+"""Disparities are certainly true; nothing is known of them."""
 
 
 class DisparityOffset:
@@ -86,15 +86,13 @@ class DisparityOffset:
         """The present estimate."""
         return self.estimate.value_px
 
-    def learn(self, adjusted: OffsetEstimate) -> None:
-        """Take in the outcome of an adjustment that began with the present estimate."""
+    def learn(self, left: OffsetEstimate) -> None:
+        """Take in what an adjustment shows of the offset that the present estimate leaves."""
         known = self.estimate
-        gained = adjusted.information - known.information
-        if not self._estimating or gained <= 0:
+        if not self._estimating or left.information <= 0:
             return
-        total = adjusted.information * adjusted.value_px - known.information * known.value_px
-        seen_px = float(np.clip(total / gained, -MAX_OFFSET_PX, MAX_OFFSET_PX))
-        weight = self._share / (1.0 / gained + WINDOW_SIGMA_PX**2)
+        seen_px = float(np.clip(known.value_px + left.value_px, -MAX_OFFSET_PX, MAX_OFFSET_PX))
+        weight = self._share / (1.0 / left.information + WINDOW_SIGMA_PX**2)
         information = known.information + weight
         value_px = (known.information * known.value_px + weight * seen_px) / information
         self.estimate = OffsetEstimate(value_px, min(information, MEMORY_SIGMA_PX**-2))

@@ -247,7 +247,7 @@ def _close_loops(merged: SparseMap, places: PlaceRecognition, begin: int) -> Non
         if matches:
             closing = plan_closing(merged, matches)
             apply_closing(merged, closing, optimise(closing.graph))
-    copied = copy_map(merged, merged.rig.offset.estimate, None)
+    copied = copy_map(merged, merged.rig.offset.value_px, None)
     apply_global(merged, solve_global(merged.rig.camera, copied, lambda: True))
 
 

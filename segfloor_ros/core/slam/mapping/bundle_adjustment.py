@@ -33,7 +33,7 @@ from segfloor_ros.core.slam.mapping.normal_equations import (
 from segfloor_ros.core.slam.rig import (
     LOCAL_KEYFRAMES,
     MIN_DEPTH_M,
-    NO_OFFSET,
+    UNKNOWN_OFFSET,
     Observations,
     OffsetEstimate,
     huber_cost,
@@ -58,8 +58,7 @@ class BundleProblem:
 
     T_camera_world: (K, 4, 4), the first `num_free` of them move. points_world: (P, 3).
     Observation i (N in total) is of point `point[i]` in keyframe `keyframe[i]`; a pair occurs at
-    most once. offset: what was known before of the error that all disparities share. factors: what
-    wheels and an accelerometer measured of keyframes.
+    most once. factors: what wheels and an accelerometer measured of keyframes.
     """
 
     T_camera_world: Array
@@ -68,14 +67,13 @@ class BundleProblem:
     keyframe: NDArray[np.intp]
     point: NDArray[np.intp]
     observations: Observations
-    offset: OffsetEstimate = NO_OFFSET
     factors: tuple[Factors, ...] = ()
 
 
 @dataclass(frozen=True)
 class BundleResult:
-    """Adjusted poses (K, 4, 4) and points (P, 3), which observations (N,) fit, and the cost
-    before and after.
+    """Adjusted poses (K, 4, 4) and points (P, 3), which observations (N,) fit, the cost before
+    and after, and the offset that all disparities show.
     """
 
     T_camera_world: Array
@@ -104,24 +102,24 @@ def adjust(
         point=problem.point[order],
         observations=problem.observations.take(order),
     )
-    start = _State.at(camera, in_order, problem.offset)
+    start = _State.at(camera, in_order)
     end = minimise(start, iterations, CONVERGED, is_wanted=is_wanted)
     adjusted = end.problem
     inliers = np.empty(len(order), bool)
     inliers[order] = end.front & (end.chi2 <= adjusted.observations.chi2_limit)
     poses, points = adjusted.T_camera_world, adjusted.points_world
-    return BundleResult(poses, points, inliers, start.cost, end.cost, adjusted.offset)
+    return BundleResult(poses, points, inliers, start.cost, end.cost, end.offset)
 
 
 @dataclass(frozen=True)
 class _State:
     """A problem on trial, with its residuals and cost. Observations are in the order of their
-    keyframes. prior: what was known of the offset at the start.
+    keyframes. offset: as the step that led here shows it.
     """
 
     camera: StereoCamera
     problem: BundleProblem
-    prior: OffsetEstimate
+    offset: OffsetEstimate
     points_camera: Array
     residual: Array
     chi2: Array
@@ -129,7 +127,9 @@ class _State:
     cost: float
 
     @staticmethod
-    def at(camera: StereoCamera, problem: BundleProblem, prior: OffsetEstimate) -> _State:
+    def at(
+        camera: StereoCamera, problem: BundleProblem, offset: OffsetEstimate = UNKNOWN_OFFSET
+    ) -> _State:
         """Evaluate a problem."""
         points = problem.points_world[problem.point]
         starts = np.searchsorted(problem.keyframe, np.arange(len(problem.T_camera_world) + 1))
@@ -139,12 +139,10 @@ class _State:
         front = points[:, 2] > MIN_DEPTH_M
         points[:, 2] = np.maximum(points[:, 2], MIN_DEPTH_M)
         residual = residuals(camera, points, problem.observations)
-        residual[:, 2] += problem.offset.value_px * problem.observations.has_disparity
         chi2 = squared_norms(residual, problem.observations.information)
         total = huber_cost(chi2, problem.observations.chi2_limit)
-        total += prior.information * (problem.offset.value_px - prior.value_px) ** 2
         total += sum(cost(factors, problem.T_camera_world) for factors in problem.factors)
-        return _State(camera, problem, prior, points, residual, chi2, front, total)
+        return _State(camera, problem, offset, points, residual, chi2, front, total)
 
     def linearised(self) -> Callable[[float], tuple[_State, float]]:
         """Return what solves the normal equations for a damping."""
@@ -160,27 +158,21 @@ class _State:
             self.residual,
             observations.information * weight[:, None] * self.front[:, None],
         )
-        system = normal_equations(self.camera, at).with_prior(
-            self.prior.information, problem.offset.value_px - self.prior.value_px
-        )
+        system = normal_equations(self.camera, at)
         system = with_factors(system, problem.T_camera_world, problem.factors)
 
         def stepped(damping: float) -> tuple[_State, float]:
             step = system.solve(damping)
             poses = problem.T_camera_world.copy()
             poses[: problem.num_free] = se3_exp(step.twists) @ poses[: problem.num_free]
-            offset_px = problem.offset.value_px + step.offset_px
             candidate = replace(
-                problem,
-                T_camera_world=poses,
-                points_world=problem.points_world + step.shifts,
-                offset=OffsetEstimate(offset_px, step.offset_information),
+                problem, T_camera_world=poses, points_world=problem.points_world + step.shifts
             )
-            trial = _State.at(self.camera, candidate, self.prior)
+            trial = _State.at(self.camera, candidate, step.offset)
             through = problem.point[self.front & ~trial.front]
             if len(through):
                 candidate.points_world[through] = problem.points_world[through]
-                trial = _State.at(self.camera, candidate, self.prior)
+                trial = _State.at(self.camera, candidate, step.offset)
             predicted = system.predicted_decrease(step, damping)
             gain = (self.cost - trial.cost) / max(predicted, SMALLEST)
             return trial, max(1 / 3, 1 - (2 * gain - 1) ** 3)
@@ -210,7 +202,7 @@ class MapCopy:
     features: list[Observations]
     records: list[KeyframeRecord]
     loops: list[LoopEdge]
-    offset: OffsetEstimate
+    offset_px: float
     up_world: Up | None
 
 
@@ -227,7 +219,7 @@ class GlobalResult:
     stable_ids: NDArray[np.int32]
 
 
-def copy_map(sparse_map: SparseMap, offset: OffsetEstimate, up_world: Up | None) -> MapCopy:
+def copy_map(sparse_map: SparseMap, offset_px: float, up_world: Up | None) -> MapCopy:
     """Copy what an adjustment needs out of the map: little time between two frames."""
     keyframes = list(sparse_map.keyframes)
     return MapCopy(
@@ -240,7 +232,7 @@ def copy_map(sparse_map: SparseMap, offset: OffsetEstimate, up_world: Up | None)
         [k.observations for k in keyframes],
         keyframes,
         list(sparse_map.loops),
-        offset,
+        offset_px,
         up_world,
     )
 
@@ -275,8 +267,7 @@ def solve_global(
         copied.xyz_world[ids],
         slot[keyframe],
         np.searchsorted(ids, point),
-        gather(copied.features, keyframe, row),
-        OffsetEstimate(copied.offset.value_px, NO_OFFSET.information),
+        gather(copied.features, keyframe, row).without_offset(copied.offset_px),
         factors_of(copied.records, slot, copied.up_world) + loop_factors(copied.loops, slot),
     )
     adjusted = adjust(camera, problem, is_wanted=is_wanted)

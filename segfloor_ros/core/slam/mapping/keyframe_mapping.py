@@ -144,14 +144,15 @@ class LocalMapper:
         )
         if len(ids) == 0:
             return None
+        taken = [k.observations for k in self._map.keyframes]
+        observations = gather(taken, edge_keyframe, edge_row)
         problem = BundleProblem(
             np.stack([self._map.keyframes[k].T_camera_world for k in chosen]),
             len(free),
             self._map.xyz_world[ids],
             slot[edge_keyframe],
             np.searchsorted(ids, edge_point),
-            gather([k.observations for k in self._map.keyframes], edge_keyframe, edge_row),
-            self._rig.offset.estimate,
+            observations.without_offset(self._rig.offset.value_px),
             factors_of(self._map.keyframes, slot, up_world),
         )
         return Adjustment(keyframe.index, problem, free, ids, edge_keyframe, edge_row, *carried)

@@ -36,6 +36,7 @@ from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.least_squares import SMALLEST
 from segfloor_ros.core.slam.rig import (
     LOCAL_KEYFRAMES,
+    OffsetEstimate,
     chi2_limit,
     huber_cost,
     huber_weights,
@@ -56,23 +57,23 @@ FLOOR_SIGMA = np.array([1e-3] * 3 + [1e-4] * 3)
 
 @dataclass(frozen=True)
 class Step:
-    """A solution: twists (K, 6) of the cameras, shifts (P, 3) of the points, the change of the
-    disparity offset and how well it is known after.
+    """A solution: twists (K, 6) of the cameras, shifts (P, 3) of the points, and the offset of all
+    disparities that it leaves.
     """
 
     twists: Array
     shifts: Array
-    offset_px: float
-    offset_information: float
+    offset: OffsetEstimate
 
 
 @dataclass(frozen=True)
 class System:
     """The normal equations by blocks: cameras U (K, 6, 6), points V (3, 3, P), and W (6, 3, M) of
     each pair (keyframe, point[m]) that an observation ties together, those of camera k from
-    starts[k] to starts[k + 1]; right-hand sides. The disparity offset is one more unknown: its
-    products with cameras (K, 6), points (3, P), itself. between: two cameras and the block (6, 6)
-    that ties them without points. adjoints (K, 6, 6): of the poses of the cameras.
+    starts[k] to starts[k + 1]; right-hand sides. shared: of what all disparities share, an offset
+    and a scale, the products with cameras (K, 6, 2), points (2, 3, P), themselves. between: two
+    cameras and the block (6, 6) that ties them without points. adjoints (K, 6, 6): of the poses of
+    the cameras.
     """
 
     U: Array
@@ -82,32 +83,28 @@ class System:
     point: NDArray[np.intp]
     camera_rhs: Array
     point_rhs: Array
-    offset_camera: Array
-    offset_point: Array
-    offset_offset: float
-    offset_rhs: float
+    shared_camera: Array
+    shared_point: Array
+    shared_shared: Array
+    shared_rhs: Array
     adjoints: Array
     between: tuple[tuple[int, int, Array], ...] = ()
-
-    def with_prior(self, information: float, offset_error_px: float) -> System:
-        """Return the system with what was known before of the offset."""
-        return replace(
-            self,
-            offset_offset=self.offset_offset + information,
-            offset_rhs=self.offset_rhs - information * offset_error_px,
-        )
 
     def solve(self, damping: float) -> Step:
         """Solve the damped system by the Schur complement on the cameras, which is sparse: most
         keyframes of a large map share no point.
 
         With V = L L^T by blocks and Y = W L^-T, the complement is U - Y Y^T.
+
+        What the disparities share is not moved by the step, but shown: the offset, whatever the
+        scale. The keyframes that hold the others have a scale by earlier disparities, with the same
+        offset; were it taken for true, each adjustment would confirm the offset of those before.
         """
         diagonal = np.einsum('aap->ap', self.V)
         L_inverse = inverse_cholesky(self.V + np.eye(3)[:, :, None] * (damping * diagonal + 1e-9))
         diagonal = np.einsum('kaa->ka', self.U)
         U = self.U + np.eye(6) * (damping * diagonal + 1e-9)[:, None]
-        y = [_times_lower(L_inverse, of_point) for of_point in (self.point_rhs, self.offset_point)]
+        y = [_times_lower(L_inverse, v) for v in (self.point_rhs, *self.shared_point)]
         complement = Complement(
             U,
             np.ascontiguousarray(self._blocks(L_inverse).transpose(2, 0, 1)),
@@ -116,17 +113,15 @@ class System:
             self.V.shape[2],
             self.between,
         )
-        of_points = np.stack(y, axis=-1).swapaxes(0, 1).reshape(-1, 2)
-        of_cameras = np.stack([self.camera_rhs, self.offset_camera], axis=-1).reshape(-1, 2)
-        rhs = of_cameras - complement.Y @ of_points
+        of_points = np.stack(y, axis=-1).swapaxes(0, 1).reshape(-1, 3)
+        of_cameras = np.concatenate([self.camera_rhs[:, :, None], self.shared_camera], axis=2)
+        rhs = of_cameras.reshape(-1, 3) - complement.Y @ of_points
         x = complement.solve(rhs, self.adjoints)
-        back = (of_points - complement.Y.T @ x).reshape(-1, 3, 2)
-        information = self.offset_offset - float((y[1] ** 2).sum() + rhs[:, 1] @ x[:, 1])
-        offset = self.offset_rhs - float((y[0] * y[1]).sum() + rhs[:, 1] @ x[:, 0])
-        offset /= information
-        only = np.array([1.0, -offset])
-        shifts = np.einsum('bap,pb->pa', L_inverse, back @ only)
-        return Step((x @ only).reshape(-1, 6), shifts, offset, information)
+        back = (of_points[:, 0] - complement.Y.T @ x[:, 0]).reshape(-1, 3)
+        shifts = np.einsum('bap,pb->pa', L_inverse, back)
+        taken = (of_points.T @ of_points + rhs.T @ x)[1:]
+        shown = _first_alone(self.shared_shared - taken[:, 1:], self.shared_rhs - taken[:, 0])
+        return Step(x[:, 0].reshape(-1, 6), shifts, shown)
 
     def _blocks(self, L_inverse: Array) -> Array:
         """Return the blocks (6, 3, M) of Y."""
@@ -141,8 +136,14 @@ class System:
         return float(
             (step.twists * (damping * diagonal_U * step.twists + self.camera_rhs)).sum()
             + (step.shifts * (damping * diagonal_V * step.shifts + self.point_rhs.T)).sum()
-            + step.offset_px * self.offset_rhs
         )
+
+
+def _first_alone(A: Array, b: Array) -> OffsetEstimate:
+    """Return the first of two unknowns of A x = b, and its information whatever the second is."""
+    share = A[0, 1] / max(A[1, 1], SMALLEST)
+    information = max(A[0, 0] - share * A[1, 0], SMALLEST)
+    return OffsetEstimate(float((b[0] - share * b[1]) / information), float(information))
 
 
 def inverse_cholesky(A: Array) -> Array:
@@ -197,7 +198,7 @@ def normal_equations(camera: StereoCamera, at: Linearisation) -> System:
     d(point); everything else is these, turned into world axes by A = M R, and moved to the camera's
     twist by (I, p x) (Barfoot 2017, eq. 7.183).
     """
-    J, M, vectors = _in_camera_axes(camera, at)
+    J, M, vectors, shared = _in_camera_axes(camera, at)
     starts = np.searchsorted(at.keyframe, np.arange(len(at.T_camera_world) + 1))
     A, V, in_world = np.empty_like(M), np.empty_like(M), np.empty_like(vectors)
     for k, T in enumerate(at.T_camera_world):
@@ -219,17 +220,18 @@ def normal_equations(camera: StereoCamera, at: Linearisation) -> System:
         at.point[free],
         -of_camera[:, :, 0],
         -of_point[0],
-        of_camera[:, :, 1],
-        of_point[1],
-        float(at.weight[:, 2].sum()),
-        -float(at.weight[:, 2] @ at.residual[:, 2]),
+        of_camera[:, :, 1:],
+        of_point[1:],
+        (shared * at.weight[:, 2]) @ shared.T,
+        -shared @ (at.weight[:, 2] * at.residual[:, 2]),
         adjoint(at.T_camera_world[: at.num_free]),
     )
 
 
-def _in_camera_axes(camera: StereoCamera, at: Linearisation) -> tuple[Array, Array, Array]:
-    """Return with J = d(u, v, d) / d(point): J^T W^0.5 (3, 3, N), J^T W J (3, 3, N), and both J^T W
-    r and J^T W of the disparity alone (2, 3, N).
+def _in_camera_axes(camera: StereoCamera, at: Linearisation) -> tuple[Array, Array, Array, Array]:
+    """Return with J = d(u, v, d) / d(point): J^T W^0.5 (3, 3, N), J^T W J (3, 3, N), J^T W of the
+    residuals and of what an offset and a scale change (3, 3, N), and these changes of the
+    disparities (2, N).
     """
     root = np.sqrt(at.weight.T)
     J = weighted_jacobian(camera, at.points_camera, root)
@@ -239,10 +241,12 @@ def _in_camera_axes(camera: StereoCamera, at: Linearisation) -> tuple[Array, Arr
     M[1, 2] = M[2, 1] = J[1, 1] * J[2, 1]
     M[2, 2] = J[2, 0] ** 2 + J[2, 1] ** 2 + J[2, 2] ** 2
     ru, rv, rd = at.residual.T * root
-    vectors = np.zeros_like(J[:2])
+    vectors = np.zeros_like(J)
     vectors[0] = J[0, 0] * ru, J[1, 1] * rv, J[2, 0] * ru + J[2, 1] * rv + J[2, 2] * rd
-    vectors[1, 2] = root[2] * J[2, 2]
-    return J, M, vectors
+    shared = np.ones((2, len(root[2])))
+    shared[1] = camera.disparity_times_depth / at.points_camera[:, 2]
+    vectors[1:, 2] = shared * root[2] * J[2, 2]
+    return J, M, vectors, shared
 
 
 def _sum_runs(values: Array, edges: NDArray[np.intp]) -> Array:

@@ -14,7 +14,7 @@ from segfloor_ros.core.slam.mapping.normal_equations import (
     normal_equations,
     with_factors,
 )
-from segfloor_ros.core.slam.rig import Observations, residuals
+from segfloor_ros.core.slam.rig import Observations, OffsetEstimate, residuals
 from segfloor_ros.core.twists import se3_exp
 
 
@@ -111,11 +111,11 @@ def test_a_step_equals_the_solution_of_the_full_normal_equations():
 
 
 def solved_at_once(system, damping):
-    """Return the solution of all unknowns, cameras, points and offset, and how well the latter is
-    known.
+    """Return the solution for cameras and points, and the offset of all disparities where that and
+    their scale are unknown, too, with its information.
     """
     cameras, points = len(system.U), system.V.shape[2]
-    size = 6 * cameras + 3 * points + 1
+    size = 6 * cameras + 3 * points + 2
     H = np.zeros((size, size))
     for k, U in enumerate(system.U):
         H[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = U
@@ -129,12 +129,15 @@ def solved_at_once(system, damping):
         H[6 * min(j, k) : 6 * min(j, k) + 6, 6 * max(j, k) : 6 * max(j, k) + 6] += (
             block if j < k else block.T
         )
-    H[:-1, -1] = np.concatenate([system.offset_camera.ravel(), system.offset_point.T.ravel()])
+    H[: 6 * cameras, -2:] = system.shared_camera.reshape(-1, 2)
+    H[6 * cameras : -2, -2:] = system.shared_point.transpose(2, 1, 0).reshape(-1, 2)
     H = np.triu(H) + np.triu(H, 1).T
-    H[:-1, :-1] += np.diag(damping * np.diag(H)[:-1])
-    H[-1, -1] = system.offset_offset
-    rhs = [system.camera_rhs.ravel(), system.point_rhs.T.ravel(), [system.offset_rhs]]
-    return np.linalg.solve(H, np.concatenate(rhs)), 1 / np.linalg.inv(H)[-1, -1]
+    H[:-2, :-2] += np.diag(damping * np.diag(H)[:-2])
+    H[-2:, -2:] = system.shared_shared
+    rhs = [system.camera_rhs.ravel(), system.point_rhs.T.ravel(), system.shared_rhs]
+    inverse, rhs = np.linalg.inv(H), np.concatenate(rhs)
+    step = np.linalg.solve(H[:-2, :-2], rhs[:-2])
+    return step, OffsetEstimate(inverse[-2] @ rhs, 1 / inverse[-2, -2])
 
 
 def test_a_solution_by_the_complement_is_that_of_all_unknowns_at_once():
@@ -145,15 +148,16 @@ def test_a_solution_by_the_complement_is_that_of_all_unknowns_at_once():
         poses, free, len(problem.points_world), problem.keyframe, problem.point, points,
         residuals(CAMERA, points, problem.observations), problem.observations.information,
     )  # fmt: skip
-    untied = normal_equations(CAMERA, at).with_prior(100.0, 0.02)
+    untied = normal_equations(CAMERA, at)
     motion = RelativeMotion(np.eye(4), 1e-3 * np.eye(6))
     links = Links.of([(1, 2, motion), (4, 3, motion), (5, 6, motion)])
     for system in (untied, with_factors(untied, poses, links)):
         step = system.solve(1e-3)
-        expected, information = solved_at_once(system, 1e-3)
-        found = [step.twists.ravel(), step.shifts.ravel(), [step.offset_px]]
+        expected, offset = solved_at_once(system, 1e-3)
+        found = [step.twists.ravel(), step.shifts.ravel()]
         np.testing.assert_allclose(np.concatenate(found), expected, atol=1e-7)
-        assert step.offset_information == pytest.approx(information, rel=1e-6)
+        assert step.offset.value_px == pytest.approx(offset.value_px, abs=1e-7)
+        assert step.offset.information == pytest.approx(offset.information, rel=1e-6)
 
 
 def test_the_inverse_factor_makes_the_inverse_also_where_a_direction_is_hardly_known():

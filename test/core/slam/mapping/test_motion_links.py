@@ -41,7 +41,8 @@ def empty_system(count):
     none = np.zeros
     return System(
         none((count, 6, 6)), none((3, 3, 0)), none((6, 3, 0)), none(count + 1, np.intp),
-        none(0, np.intp), none((count, 6)), none((3, 0)), none((count, 6)), none((3, 0)), 1.0, 0.0,
+        none(0, np.intp), none((count, 6)), none((3, 0)), none((count, 6, 2)), none((2, 3, 0)),
+        np.eye(2), none(2),
         np.tile(np.eye(6), (count, 1, 1)),
     )  # fmt: skip
 
