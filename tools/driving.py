@@ -7,14 +7,16 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from segfloor_ros.apps.cli.terminal import Announce
 from segfloor_ros.apps.recordings import StereoSource, open_source
 from segfloor_ros.apps.simulation.scene_file import open_scene
 from segfloor_ros.apps.simulation.simulation import render_once
+from segfloor_ros.core.camera.model import is_disparity
 from segfloor_ros.core.camera.recording import MeasurementLog, RecordedSensor
 from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.contracts import FrameResult, StereoFrame
@@ -60,14 +62,17 @@ def after_sensors(
 
 
 def noisy(frames: Iterable[StereoFrame], seed: int) -> Iterator[StereoFrame]:
-    """Yield frames with noise of one grey level added, by a seed; 0: as they are."""
+    """Yield frames with noise of one grey level added to images, by a seed; 0: as they are."""
     rng = np.random.default_rng(seed)
+
+    def spoiled(image: NDArray[Any]) -> NDArray[Any]:
+        if is_disparity(image):
+            return image
+        return np.clip(np.rint(image + rng.normal(0, 1, image.shape)), 0, 255).astype(np.uint8)
+
     for frame in frames:
         if seed:
-            left, right = (
-                np.clip(np.rint(image + rng.normal(0, 1, image.shape)), 0, 255).astype(np.uint8)
-                for image in (frame.left, frame.right)
-            )
+            left, right = spoiled(frame.left), spoiled(frame.right)
             frame = dataclasses.replace(frame, left=left, right=right)
         yield frame
 

@@ -85,6 +85,8 @@ def track(
         for step in drive(slam, frames, on_progress):
             total += 1
             for result in step.results:
+                while poses and poses[-1].stamp_ns >= result.stamp_ns:  # they come once more
+                    poses.pop()
                 if result.tracked:
                     pose = TrackedPose(
                         result.stamp_ns, result.T_odom_base, result.reference_keyframe_ns

@@ -79,3 +79,12 @@ def test_floor_is_segmented_without_each_mechanism(name) -> None:
         mask = stage.process(left, right, room.mount).mask
     assert mask.shape == left.shape
     assert np.mean(mask == FLOOR) > 0.2
+
+
+def test_noise_leaves_a_disparity_as_it_is() -> None:
+    left, disparity = np.full((9, 9), 100, np.uint8), np.full((9, 9), 7.5, np.float32)
+    frame = StereoFrame(0, 0, left, disparity)
+    (as_it_was,), (spoiled,) = noisy([frame], 0), noisy([frame], 1)
+    assert as_it_was is frame
+    np.testing.assert_array_equal(spoiled.right, disparity)
+    assert 0 < np.abs(spoiled.left - left.astype(float)).max() < 6
