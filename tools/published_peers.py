@@ -3,7 +3,8 @@ stella_vslam, ORB-SLAM2 and ORB-SLAM3, each on a rectified recording in the layo
 
 A folder has runners for some of them: `bin/rtabgrid slam DIR`, `bin/stella_kitti VOCABULARY DIR`,
 `bin/orb_kitti VOCABULARY DIR` and `bin/orb3_kitti VOCABULARY DIR`, each with `--out PATH.txt`
-(TUM), and their vocabularies in `vocab`.
+(TUM), and their vocabularies in `vocab`. `tools/orb3_kitti.py` is the last of them, and says how
+ORB-SLAM3 is installed; `tools.vocabulary_text` writes `vocab/orb.txt` and `vocab/orb3.txt`.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def run_peers(
     drive: str, recording: Path, peers: Path, out: Path, announce: Announce
 ) -> list[SlamRow]:
     """Return the rows of ours and of all systems that have a runner, on a recording with a true
-    path, run one after the other.
+    path, run one after the other. What each of them printed is kept beside its path.
     """
     out.mkdir(parents=True, exist_ok=True)
     commands: dict[str, list[str | Path]] = {
@@ -74,7 +75,8 @@ def run_peers(
         announce(f'{system} on {drive}', 0)
         path = out / f'{number}' if system == OURS else out / f'{number}.txt'
         try:
-            _, cpu_s, peak_mb = run_program([*command, '--out', path])
+            said, cpu_s, peak_mb = run_program([*command, '--out', path])
+            (out / f'{number}.log').write_text(said, encoding='utf-8')
             score = score_trajectory(match_files(path, recording / 'poses.txt'))
         except SegfloorError as error:
             rows.append(SlamRow(drive, system, problem=str(error)))

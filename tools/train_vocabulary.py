@@ -23,17 +23,16 @@ FRAMES_PER_RECORDING = 80
 STEPS = 12
 
 
-def sample(recording: str) -> NDArray[np.uint8]:
-    """Return descriptors (N, 32) of frames spread over a recording."""
+def views(recording: str) -> list[NDArray[np.uint8]]:
+    """Return the descriptors (N, 32) of each of the frames spread over a recording."""
     source = open_source(resolve(None, (), stereo_camera={'input': recording}).stereo_camera)
     every = max(1, (source.frame_count or 0) // FRAMES_PER_RECORDING)
     extractor = FeatureExtractor(StereoSlamSettings())
-    found = [
+    return [
         extractor.extract(frame.left).descriptor
         for frame in source.frames()
         if frame.index % every == 0
     ]
-    return np.concatenate(found)
 
 
 def cluster(descriptor: NDArray[np.uint8], seed: int) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
@@ -72,7 +71,7 @@ def main() -> None:
     default = Path(vocabulary.__file__).with_name(vocabulary.FILE)
     parser.add_argument('--out', type=Path, default=default)
     arguments = parser.parse_args()
-    descriptor = np.concatenate([sample(recording) for recording in arguments.recordings])
+    descriptor = np.concatenate([d for one in arguments.recordings for d in views(one)])
     np.save(arguments.out, train(descriptor), allow_pickle=False)
     print(f'{len(descriptor)} descriptors, {arguments.out.stat().st_size} bytes')
 

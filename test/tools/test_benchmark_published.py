@@ -171,6 +171,8 @@ def test_other_programs_estimate_the_same_path(tmp_path):
     assert list(rows) == ['segfloor_ros', *list(RUNNERS)[:-1]]  # the last has no runner here
     for name in ('RTAB-Map', 'ORB-SLAM2'):
         assert rows[name].path_error_m == pytest.approx(0.0, abs=1e-6)
+    said = (tmp_path / 'paths' / '1.log').read_text()
+    assert said.strip() == 'rtabmap-slam frames 3 slam_nodes 7 loops 0'
     for row in (rows['segfloor_ros'], rows['RTAB-Map']):
         assert row.tracked_percent == 100 and row.path_error_m < 0.02
         assert row.peak_mb > 1 and row.cpu_s > 0.01
