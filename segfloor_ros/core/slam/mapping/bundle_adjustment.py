@@ -58,7 +58,8 @@ class BundleProblem:
 
     T_camera_world: (K, 4, 4), the first `num_free` of them move. points_world: (P, 3).
     Observation i (N in total) is of point `point[i]` in keyframe `keyframe[i]`; a pair occurs at
-    most once. factors: what wheels and an accelerometer measured of keyframes.
+    most once. factors: what wheels and an accelerometer measured of keyframes. shows_offset:
+    whether the offset that all disparities show is wanted.
     """
 
     T_camera_world: Array
@@ -68,6 +69,7 @@ class BundleProblem:
     point: NDArray[np.intp]
     observations: Observations
     factors: tuple[Factors, ...] = ()
+    shows_offset: bool = True
 
 
 @dataclass(frozen=True)
@@ -159,6 +161,7 @@ class _State:
             observations.information * weight[:, None] * self.front[:, None],
         )
         system = normal_equations(self.camera, at)
+        system = system if problem.shows_offset else system.without_shared()
         system = with_factors(system, problem.T_camera_world, problem.factors)
 
         def stepped(damping: float) -> tuple[_State, float]:
@@ -269,6 +272,7 @@ def solve_global(
         np.searchsorted(ids, point),
         gather(copied.features, keyframe, row).without_offset(copied.offset_px),
         factors_of(copied.records, slot, copied.up_world) + loop_factors(copied.loops, slot),
+        shows_offset=False,
     )
     adjusted = adjust(camera, problem, is_wanted=is_wanted)
     T_before = np.stack([copied.first_poses[k] for k in early])

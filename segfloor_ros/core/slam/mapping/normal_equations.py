@@ -36,6 +36,7 @@ from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.least_squares import SMALLEST
 from segfloor_ros.core.slam.rig import (
     LOCAL_KEYFRAMES,
+    UNKNOWN_OFFSET,
     OffsetEstimate,
     chi2_limit,
     huber_cost,
@@ -90,6 +91,12 @@ class System:
     adjoints: Array
     between: tuple[tuple[int, int, Array], ...] = ()
 
+    def without_shared(self) -> System:
+        """Return the system that shows no offset, which costs a third to solve."""
+        return replace(
+            self, shared_camera=self.shared_camera[:, :, :0], shared_point=self.shared_point[:0]
+        )
+
     def solve(self, damping: float) -> Step:
         """Solve the damped system by the Schur complement on the cameras, which is sparse: most
         keyframes of a large map share no point.
@@ -113,15 +120,18 @@ class System:
             self.V.shape[2],
             self.between,
         )
-        of_points = np.stack(y, axis=-1).swapaxes(0, 1).reshape(-1, 3)
+        of_points = np.stack(y, axis=-1).swapaxes(0, 1).reshape(-1, len(y))
         of_cameras = np.concatenate([self.camera_rhs[:, :, None], self.shared_camera], axis=2)
-        rhs = of_cameras.reshape(-1, 3) - complement.Y @ of_points
+        rhs = of_cameras.reshape(-1, len(y)) - complement.Y @ of_points
         x = complement.solve(rhs, self.adjoints)
         back = (of_points[:, 0] - complement.Y.T @ x[:, 0]).reshape(-1, 3)
         shifts = np.einsum('bap,pb->pa', L_inverse, back)
+        step = Step(x[:, 0].reshape(-1, 6), shifts, UNKNOWN_OFFSET)
+        if len(y) == 1:
+            return step
         taken = (of_points.T @ of_points + rhs.T @ x)[1:]
         shown = _first_alone(self.shared_shared - taken[:, 1:], self.shared_rhs - taken[:, 0])
-        return Step(x[:, 0].reshape(-1, 6), shifts, shown)
+        return replace(step, offset=shown)
 
     def _blocks(self, L_inverse: Array) -> Array:
         """Return the blocks (6, 3, M) of Y."""

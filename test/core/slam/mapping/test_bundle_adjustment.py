@@ -14,7 +14,7 @@ from segfloor_ros.core.slam.mapping.normal_equations import (
     normal_equations,
     with_factors,
 )
-from segfloor_ros.core.slam.rig import Observations, OffsetEstimate, residuals
+from segfloor_ros.core.slam.rig import UNKNOWN_OFFSET, Observations, OffsetEstimate, residuals
 from segfloor_ros.core.twists import se3_exp
 
 
@@ -158,6 +158,10 @@ def test_a_solution_by_the_complement_is_that_of_all_unknowns_at_once():
         np.testing.assert_allclose(np.concatenate(found), expected, atol=1e-7)
         assert step.offset.value_px == pytest.approx(offset.value_px, abs=1e-7)
         assert step.offset.information == pytest.approx(offset.information, rel=1e-6)
+        alone = system.without_shared().solve(1e-3)
+        np.testing.assert_allclose(alone.twists, step.twists, atol=1e-9)
+        np.testing.assert_allclose(alone.shifts, step.shifts, atol=1e-9)
+        assert alone.offset == UNKNOWN_OFFSET
 
 
 def test_the_inverse_factor_makes_the_inverse_also_where_a_direction_is_hardly_known():
