@@ -92,7 +92,7 @@ class System:
     between: tuple[tuple[int, int, Array], ...] = ()
 
     def without_shared(self) -> System:
-        """Return the system that shows no offset, which costs a third to solve."""
+        """Return the system that shows no offset: one right-hand side in place of three."""
         return replace(
             self, shared_camera=self.shared_camera[:, :, :0], shared_point=self.shared_point[:0]
         )
