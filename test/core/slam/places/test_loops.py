@@ -30,6 +30,10 @@ SETTINGS = StereoSlamSettings(num_features=600)
 TURN = 52
 BENT_AT = 44
 
+BENT_BY = np.array([0.4, 0.0, 0.1, 0.0, 0.03, 0.0])
+"""A drift that loops find with each of the versions and processors; whether they find one of 0.3 m
+hangs on rounding."""
+
 
 def on_the_spot(count):
     """A turn of a bit more than a circle, 8 degrees a frame, along a small circle."""
@@ -68,8 +72,8 @@ def closed():
     return drive(np.array([0.3, 0.0, 0.1, 0.0, 0.03, 0.0]))
 
 
-def test_a_drift_is_found_and_taken_away(closed):
-    slam, errors = closed
+def test_a_drift_is_found_and_taken_away():
+    slam, errors = drive(BENT_BY)
     assert max(errors[BENT_AT : BENT_AT + 3]) > 0.1
     assert slam.back_end.loop_count >= 1
     verdicts = [candidate.verdict for candidate in slam.back_end.loops.candidates]
@@ -79,7 +83,7 @@ def test_a_drift_is_found_and_taken_away(closed):
 
 def test_a_loop_that_contradicts_the_map_is_not_noted_as_closed(monkeypatch):
     monkeypatch.setattr(back_end, 'apply_closing', lambda *_: False)
-    slam, _ = drive(np.array([0.3, 0.0, 0.1, 0.0, 0.03, 0.0]))
+    slam, _ = drive(BENT_BY)
     verdicts = {candidate.verdict for candidate in slam.back_end.loops.candidates}
     assert 'contradicts the map' in verdicts
     assert 'closed' not in verdicts
