@@ -43,6 +43,10 @@ FITTING = 0.95
 GATE = 0.999
 """Probability with which what agrees is taken to agree, where a false alarm costs more."""
 
+ROLLED_SIGMA, ROLLED_FRAMES = np.array([1e-4, 1e-4]), 30
+"""Least standard deviation of the twist during the readout, in metres and radians: 0.05 px; and
+frames that count for it."""
+
 MIN_DEPTH_M = 0.05
 
 SAME_PX = 4
@@ -98,6 +102,41 @@ class DisparityOffset:
         self.estimate = OffsetEstimate(value_px, min(information, MEMORY_SIGMA_PX**-2))
 
 
+class RollingShutter:
+    """How far the camera moves while an image is read out row by row, as the drive shows it.
+
+    The twist from the first row to the last is unknown in each frame, and 0 on average; its
+    variances, one of ways and one of turns, are estimated from those of the frames before
+    (expectation maximisation). Of a camera that exposes all rows at once they become nothing.
+    """
+
+    def __init__(self) -> None:
+        self._variance = ROLLED_SIGMA**2
+        self._count = 1.0
+
+    @property
+    def variance(self) -> Array:
+        """Of the twist (6,)."""
+        return np.repeat(self._variance, 3)
+
+    def learn(self, squared: Array) -> None:
+        """Take in the expected squares (6,) of the twist of a frame."""
+        self._count = min(self._count + 1, ROLLED_FRAMES)
+        seen = squared.reshape(2, 3).mean(axis=1)
+        self._variance = self._variance + (seen - self._variance) / self._count
+        self._variance = np.maximum(self._variance, ROLLED_SIGMA**2)
+
+
+def rolled(points: Array, share: Array, twist: Array) -> Array:
+    """Return points (3, N) of the camera as rows see them that are read out a share (N,) of the
+    readout time later than the middle one, in which the camera moves by a twist (6,).
+    """
+    x, y, z = points
+    a, b, c = twist[3:]
+    turned = np.stack([b * z - c * y, c * x - a * z, a * y - b * x])
+    return np.asarray(points + share * (twist[:3, None] + turned))
+
+
 @dataclass
 class Rig:
     """What all of SLAM knows of the stereo rig. mount: None until it is measured or given.
@@ -109,6 +148,7 @@ class Rig:
     mount: Mount | None = None
     mount_may_change: bool = False
     base: Mount | None = None
+    shutter: RollingShutter = field(default_factory=RollingShutter)
     offset: DisparityOffset = field(
         default_factory=lambda: DisparityOffset(OFFSET_SIGMA_PX, 1.0 / LOCAL_KEYFRAMES)
     )

@@ -245,7 +245,7 @@ class StereoSlam:
             motion.T_camera_world,
             observed.features,
             observed.features.octave,
-            observed.observations,
+            observed.unrolled(self.rig),
             self.map.living(observed.point_id),
             motion.since_keyframe.start(
                 motion.T_camera_world, observed.known_share * motion.covariance
@@ -253,7 +253,8 @@ class StereoSlam:
             self.sensors.up_camera(self.front_end.motion.T_odom_camera),
             ground=self._ground.take(frame.left),
         )
-        patches = sample_patches(images.left, keyframe.observations.uvd_px[:, :2]).astype(np.uint8)
+        uv_px = observed.observations.uvd_px[:, :2]
+        patches = sample_patches(images.left, uv_px).astype(np.uint8)
         self.back_end.add(keyframe, patches)
         if searched is not None:
             self._moving.remember(keyframe, searched.disparity)
@@ -265,7 +266,7 @@ class StereoSlam:
             keyframe = self.map.keyframes[-1]
         else:
             self.back_end.take_in(keyframe, images, self.sensors.up_world)
-        self.front_end.continue_from(images, keyframe)
+        self.front_end.continue_from(images, keyframe, uv_px)
         return take_snapshot(self.map, keyframe, frame, images.moving)
 
     def _result(

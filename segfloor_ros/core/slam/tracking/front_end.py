@@ -146,6 +146,8 @@ class FrontEnd:
             return None
         track = replace(track, sigma_m=sigma_m(track.covariance))
         T_seen = None if knows_less else track.T_camera_world
+        if track.estimate.rolled_squares is not None:
+            self._map.rig.shutter.learn(track.estimate.rolled_squares)
         track = self._weighed(replace(track, prior=prior))
         self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
         self.follower.see(images, track.point_ids, track.uv_px)
@@ -256,7 +258,15 @@ class FrontEnd:
         seen = track.observations.without_offset(rig.offset.value_px)
         seen = seen.with_noise_factor(by_images.noise_factor)
         points, start = self._map.xyz_world[track.point_ids], by_images.T_camera_world
-        found = refine_pose(rig.camera, start, points, seen, prior, is_noise_known=True)
+        found = refine_pose(
+            rig.camera,
+            start,
+            points,
+            seen,
+            prior,
+            is_noise_known=True,
+            roll_variance=rig.shutter.variance,
+        )
         pose, covariance = found.T_camera_world, found.covariance
         weighed = replace(by_images, T_camera_world=pose, covariance=covariance)
         return replace(track, estimate=weighed)
@@ -335,11 +345,11 @@ class FrontEnd:
         self._map.points.note_tracking(matched.visible_ids, matched.point_ids)
         return matched.observed
 
-    def continue_from(self, images: Images, keyframe: KeyframeRecord) -> None:
-        """Track on from the points of a keyframe, old and new."""
+    def continue_from(self, images: Images, keyframe: KeyframeRecord, uv_px: Array) -> None:
+        """Track on from the points of a keyframe, old and new. uv_px: (F, 2) of its features."""
         rows = np.flatnonzero(keyframe.point_id != NO_POINT)
         ids = keyframe.point_id[rows]
-        self.follower.see(images, ids, keyframe.observations.uvd_px[rows, :2])
+        self.follower.see(images, ids, uv_px[rows])
         self.local.move_to(ids, keyframe.T_camera_world)
         self.frames_since_keyframe, self.keyframe_ns = 0, keyframe.stamp_ns
 

@@ -29,6 +29,7 @@ from segfloor_ros.core.slam.rig import (
     NEIGHBOURS,
     Observations,
     in_view,
+    rolled,
 )
 from segfloor_ros.core.slam.sparse_map import Covisible, SparseMap, median_depth_m
 from segfloor_ros.core.slam.tracking.evidence import is_proof
@@ -167,7 +168,10 @@ class Tracker:
             observations.take(rows),
             seen.ids,
             ObservedFeatures(
-                features, observations.with_noise_factor(estimate.noise_factor), point_id
+                features,
+                observations.with_noise_factor(estimate.noise_factor),
+                point_id,
+                estimate.roll,
             ),
         )
 
@@ -260,14 +264,18 @@ def predict_points(
     ids: NDArray[np.int32],
     T_camera_world: Array,
     excluded: Region | None = None,
+    roll: Array | None = None,
 ) -> Prediction:
     """Project points (N,) into the image and keep those that a camera there should recognise:
     inside the image, from about the known direction, at a size the pyramid has, and not in a region
-    that is excluded.
+    that is excluded. roll: (6,) the twist during the readout of the image.
     """
     camera = sparse_map.rig.camera
     points = transform_points(T_camera_world, sparse_map.xyz_world[ids])
     uvd, visible = in_view(camera, points)
+    if roll is not None:
+        share = np.nan_to_num((uvd[:, 1] - camera.cy) / camera.height).clip(-0.5, 0.5)
+        uvd, visible = in_view(camera, rolled(points.T, share, roll).T)
     visible[visible] = ~is_inside(excluded, uvd[visible, :2])
     ids, points, uvd = ids[visible], points[visible], uvd[visible]
     distance = np.sqrt((points**2).sum(axis=1))
@@ -427,7 +435,7 @@ class Follower:
         if roughly is None:
             return None
         pose = roughly.T_camera_world
-        seen = self._select(local_ids, pose, images.excluded)
+        seen = self._select(local_ids, roughly, images.excluded)
         observations = Observations(seen.uvd_px.copy(), np.ones((len(seen.ids), 3)))
         rows = np.arange(len(seen.ids))
         rows = rows[align_pixels(images.left, observations, rows, self._map, seen.ids, pose)]
@@ -467,10 +475,10 @@ class Follower:
 
     @timed
     def _select(
-        self, local_ids: NDArray[np.int32], T_camera_world: Array, excluded: Region | None
+        self, local_ids: NDArray[np.int32], known: PoseEstimate, excluded: Region | None
     ) -> Prediction:
         """Return points that should be seen, spread over the image, the often found first."""
-        seen = predict_points(self._map, local_ids, T_camera_world, excluded)
+        seen = predict_points(self._map, local_ids, known.T_camera_world, excluded, known.roll)
         if len(seen.ids) <= TRACKED_POINTS:
             return seen
         area = self._camera.width * self._camera.height

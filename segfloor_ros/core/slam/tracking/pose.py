@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -28,6 +28,7 @@ from segfloor_ros.core.slam.rig import (
     huber_cost,
     huber_weights,
     is_gated,
+    rolled,
 )
 from segfloor_ros.core.slam.sparse_map import SparseMap
 from segfloor_ros.core.slam.thresholds import PROOF
@@ -108,7 +109,9 @@ class PoseEstimate:
 
     T_camera_world: (4, 4). inliers: (N,) bool over the observations. covariance: (6, 6) of the
     twist in T_camera_world <- exp(twist) T_camera_world, order translation (m), rotation (rad).
-    log_ratio: of the likelihood of the observations over that of chance (see `evidence`).
+    log_ratio: of the likelihood of the observations over that of chance (see `evidence`). roll,
+    rolled_squares: (6,) the twist during the readout of the image, and what its squares are
+    expected to be.
     """
 
     T_camera_world: Array
@@ -116,6 +119,8 @@ class PoseEstimate:
     covariance: Array
     noise_factor: float
     log_ratio: float = 0.0
+    roll: Array = field(default_factory=lambda: np.zeros(6))
+    rolled_squares: Array | None = None
 
     def evidence(self, expected: PoseEstimate | None = None) -> float:
         """Return how much the observations say for the pose. expected: where the camera was to be;
@@ -174,6 +179,7 @@ def refine_pose(
     searched: Searched = WHOLE,
     is_noise_known: bool = False,
     first: NDArray[np.bool_] | None = None,
+    roll_variance: Array | None = None,
 ) -> PoseEstimate:
     """Refine a pose by Levenberg-Marquardt on (u, v, d) with a Huber cost, dropping outliers
     between rounds.
@@ -183,20 +189,22 @@ def refine_pose(
     right and wrong matches shows by how much, and the bound on outliers follows it, unless the
     noise is known. prior: the pose by other sensors; it adds what the points do not determine.
     searched: where the matches were looked for. first: which (N,) agree with the pose at the start.
+    roll_variance: (6,) of the twist during the readout, which is estimated, too (Hedborg et al.,
+    Rolling Shutter Bundle Adjustment, CVPR 2012); None for a camera without.
     """
     seen = _Seen.of(camera, points_world, observations)
     inliers = np.ones(len(points_world), bool) if first is None else first
     if not len(points_world):
         unknown = PoseEstimate(T_camera_world, inliers, np.eye(6) * UNKNOWN_COVARIANCE, 1.0)
         return replace(prior or unknown, inliers=inliers)
-    known = _Prior() if prior is None else _Prior.of(prior)
+    known = replace(_Prior() if prior is None else _Prior.of(prior), roll_variance=roll_variance)
     log_chance = searched.log_chance(camera, observations)
     mixture: Mixture | None = None
-    pose, factor = T_camera_world, 1.0
+    pose, roll, factor = T_camera_world, np.zeros(6), 1.0
     for _ in range(ROUNDS):
-        state = _State(pose, seen.take(inliers), known)
-        pose = minimise(state, STEPS_PER_ROUND, CONVERGED).pose
-        rays, chi2 = seen.distances(pose)
+        best = minimise(_State(pose, roll, seen.take(inliers), known), STEPS_PER_ROUND, CONVERGED)
+        pose, roll = best.pose, best.roll
+        rays, chi2 = seen.distances(pose, roll)
         start = 1.0 if is_noise_known else math.sqrt(max(1.0, float(np.median(chi2 / seen.median))))
         mixture = Mixture.fit(
             chi2, seen.dimensions, log_chance, start, searched.missed, searched.largest_factor
@@ -208,34 +216,58 @@ def refine_pose(
             break
     if not is_enough:
         return PoseEstimate(pose, inliers, np.eye(6) * UNKNOWN_COVARIANCE, factor)
-    # Huber's weight of an inlier is 1.
-    J = seen.take(inliers).jacobian(rays[:, inliers], 1 / factor)
-    covariance = np.linalg.inv(J @ J.T + known.information + np.eye(6) / UNKNOWN_COVARIANCE)
     assert mixture is not None
-    return PoseEstimate(pose, inliers, covariance, factor, mixture.log_ratio)
+    # Huber's weight of an inlier is 1.
+    J = seen.take(inliers).jacobian(rays[:, inliers], 1 / factor, roll_variance is not None)
+    H = J @ J.T
+    covariance = np.linalg.inv(H + known.all_information(np.eye(6) / UNKNOWN_COVARIANCE))
+    estimate = PoseEstimate(pose, inliers, covariance[:6, :6], factor, mixture.log_ratio)
+    if roll_variance is None:
+        return estimate
+    unlikely = gained(H[6:, 6:], np.diag(roll_variance)) + 0.5 * float(roll**2 @ (1 / roll_variance))
+    squares = roll**2 + np.diag(covariance)[6:]
+    ratio = mixture.log_ratio - unlikely
+    return replace(estimate, log_ratio=ratio, roll=roll, rolled_squares=squares)
 
 
 @dataclass(frozen=True)
 class _Prior:
     """What is known of a pose before any point is seen, nothing by default. T_world_camera:
-    (4, 4). information: (6, 6) of the twist.
+    (4, 4). information: (6, 6) of the twist. roll_variance: (6,), None without a roll.
     """
 
     T_world_camera: Array | None = None
     information: Array | float = 0.0
+    roll_variance: Array | None = None
 
     @staticmethod
     def of(estimate: PoseEstimate) -> _Prior:
         """Return what another estimate tells."""
         return _Prior(invert(estimate.T_camera_world), np.linalg.inv(estimate.covariance))
 
-    def at(self, T_camera_world: Array) -> tuple[Array | float, float]:
-        """Return the gradient (6,) of half the squared error of a pose, and that squared error."""
-        if self.T_world_camera is None:
-            return 0.0, 0.0
-        error = se3_log(T_camera_world @ self.T_world_camera)
-        gradient = self.information @ error
-        return gradient, float(error @ gradient)
+    def all_information(self, more: Array | float = 0.0) -> Array | float:
+        """Return that of pose and roll, (12, 12), or of the pose alone. more: (6, 6), of the pose."""
+        if self.roll_variance is None:
+            return self.information + more
+        known = np.zeros((12, 12))
+        known[:6, :6] = self.information + more
+        known[6:, 6:] = np.diag(1 / self.roll_variance)
+        return known
+
+    def at(self, T_camera_world: Array, roll: Array) -> tuple[Array | float, float]:
+        """Return the gradient (6,) or (12,) of half the squared error of a pose and a roll, and that
+        squared error.
+        """
+        gradient: Array | float = 0.0
+        strain = 0.0
+        if self.T_world_camera is not None:
+            error = se3_log(T_camera_world @ self.T_world_camera)
+            gradient = self.information @ error
+            strain = float(error @ gradient)
+        if self.roll_variance is None:
+            return gradient, strain
+        of_roll = roll / self.roll_variance
+        return np.append(np.zeros(6) + gradient, of_roll), strain + float(roll @ of_roll)
 
 
 @dataclass(frozen=True)
@@ -243,9 +275,9 @@ class _Seen:
     """Points and their observations, one long row (N,) for each coordinate, in few arrays: NumPy
     takes as long to begin as to compute hundreds of numbers.
 
-    rows: (11, N), points of the world, focal lengths and disparity times depth, what was measured
+    rows: (12, N), points of the world, focal lengths and disparity times depth, what was measured
     from the principal point, both in standard deviations, 0 where nothing is measured; limit and
-    median of chi2.
+    median of chi2; and when the pixel was read out, in shares of the whole image.
     """
 
     rows: Array
@@ -253,7 +285,7 @@ class _Seen:
     @staticmethod
     def of(camera: StereoCamera, points_world: Array, observations: Observations) -> _Seen:
         """Return them, for points (N, 3)."""
-        rows = np.empty((11, len(points_world)))
+        rows = np.empty((12, len(points_world)))
         rows[:3] = points_world.T
         measured = np.isfinite(observations.uvd_px)
         certainty = np.where(measured, 1.0 / observations.sigma_px, 0.0)
@@ -262,6 +294,7 @@ class _Seen:
         from_centre = observations.uvd_px - (camera.cx, camera.cy, 0.0)
         rows[6:9] = np.where(measured, from_centre * certainty, 0.0).T
         rows[9], rows[10] = observations.chi2_limit, observations.chi2_median
+        rows[11] = from_centre[:, 1] / camera.height
         return _Seen(rows)
 
     @property
@@ -283,13 +316,15 @@ class _Seen:
         """Return the chosen ones."""
         return self if columns.all() else _Seen(self.rows[:, columns])
 
-    def at(self, T_camera_world: Array) -> tuple[Array, Array, Array]:
+    def at(self, T_camera_world: Array, roll: Array) -> tuple[Array, Array, Array]:
         """Return rays (3, N) = (x / z, y / z, 1 / z) to the points at a pose, the residuals (3, N)
         in standard deviations, and their squares (N,); points that are behind the camera are just
-        before it.
+        before it. roll: (6,) the twist during the readout.
         """
         rays = T_camera_world[:3, :3] @ self.rows[:3]
         rays += T_camera_world[:3, 3:]
+        if roll.any():
+            rays = rolled(rays, self.rows[11], roll)
         inverse_z = 1.0 / np.maximum(rays[2], MIN_DEPTH_M)
         rays[:2] *= inverse_z
         rays[2] = inverse_z
@@ -297,17 +332,18 @@ class _Seen:
         residual -= self.rows[6:9]
         return rays, residual, np.einsum('an,an->n', residual, residual)
 
-    def distances(self, T_camera_world: Array) -> tuple[Array, Array]:
+    def distances(self, T_camera_world: Array, roll: Array) -> tuple[Array, Array]:
         """Return the rays (3, N) and the squared residuals (N,) of `at`; what is behind the camera
         fits nothing.
         """
-        rays, _, chi2 = self.at(T_camera_world)
+        rays, _, chi2 = self.at(T_camera_world, roll)
         chi2[rays[2] >= 1 / MIN_DEPTH_M] = 1e12
         return rays, chi2
 
-    def jacobian(self, rays: Array, root: Array | float) -> Array:
+    def jacobian(self, rays: Array, root: Array | float, has_roll: bool) -> Array:
         """Return the derivatives (6, 3 N) of what is seen along rays (3, N) by the twist of the
-        pose, in standard deviations times the roots (N,) of weights (Barfoot 2017, eq. 7.183).
+        pose, in standard deviations times the roots (N,) of weights (Barfoot 2017, eq. 7.183); with
+        a roll (12, 3 N), also by that.
         """
         x, y, inverse_z = rays
         by_z = self.rows[3:6] * root
@@ -323,18 +359,22 @@ class _Seen:
         J[4, 0] += u
         np.multiply(u, -y, out=J[5, 0])
         np.multiply(v, x, out=J[5, 1])
-        return J.reshape(6, -1)
+        if has_roll:
+            J = np.concatenate([J, J * self.rows[11]])
+        return J.reshape(len(J), -1)
 
 
 class _State:
-    """A pose on trial, (4, 4), of points that are seen, and of what was known before. cost: where
-    that is known without a look at the points.
+    """A pose on trial, (4, 4), and the twist (6,) during the readout, of points that are seen, and
+    of what was known before. cost: where that is known without a look at the points.
     """
 
-    def __init__(self, pose: Array, seen: _Seen, prior: _Prior, cost: float | None = None) -> None:
-        self.pose, self._seen, self._prior = pose, seen, prior
+    def __init__(
+        self, pose: Array, roll: Array, seen: _Seen, prior: _Prior, cost: float | None = None
+    ) -> None:
+        self.pose, self.roll, self._seen, self._prior = pose, roll, seen, prior
         if cost is None:
-            self._view, (self._pull, strain) = seen.at(pose), prior.at(pose)
+            self._view, (self._pull, strain) = seen.at(pose, roll), prior.at(pose, roll)
             cost = huber_cost(self._view[2], seen.limit) + strain
         self.cost = cost
 
@@ -342,19 +382,20 @@ class _State:
         """Return what solves the normal equations for a damping."""
         rays, residual, chi2 = self._view
         root = np.sqrt(huber_weights(chi2, self._seen.limit))
-        J = self._seen.jacobian(rays, root)
-        H, g = J @ J.T + self._prior.information, J @ (residual * root).ravel() + self._pull
+        J = self._seen.jacobian(rays, root, self._prior.roll_variance is not None)
+        H, g = J @ J.T + self._prior.all_information(), J @ (residual * root).ravel() + self._pull
 
         def stepped(damping: float) -> tuple[_State, float]:
             damped = H.copy()
-            diagonal = damped.ravel()[::7]
+            diagonal = damped.ravel()[:: len(H) + 1]
             diagonal += damping * (diagonal + 1e-9)
             step = np.linalg.solve(damped, -g)
             decrease = float(-g @ step)
             # What is predicted to gain too little to go on is not computed.
             cost = self.cost - decrease if decrease < CONVERGED * self.cost else None
-            trial = _State(se3_exp(step) @ self.pose, self._seen, self._prior, cost)
-            return trial, SHRINK
+            roll = self.roll + step[6:] if len(step) > 6 else self.roll
+            pose = se3_exp(step[:6]) @ self.pose
+            return _State(pose, roll, self._seen, self._prior, cost), SHRINK
 
         return stepped
 
@@ -388,10 +429,11 @@ class Consensus:
         looked for. known: the pose of the same image by other measurements.
         """
         points = self._map.xyz_world[ids]
-        problem = _Problem(self._camera, points, observations, searched)
+        variance = self._map.rig.shutter.variance
+        problem = _Problem(self._camera, points, observations, searched, variance)
         of_most = problem.refined(T_start)
         if known is not None and differ(of_most, known):
-            return problem.near(known.T_camera_world, known.noise_factor)
+            return problem.near(known, known.noise_factor)
         record = self.record(ids, T_start)
         proven = record >= PROVEN
         if not proven.any() or of_most.inliers[proven].mean() > USUAL_SHARE:
@@ -399,19 +441,19 @@ class Consensus:
         of_proven = problem.take(proven).refined(T_start)
         if not differ(of_most, of_proven):
             return of_most
-        before = problem.fitting(of_most.T_camera_world, of_proven.noise_factor)
-        after = problem.fitting(of_proven.T_camera_world, of_proven.noise_factor)
+        before = problem.fitting(of_most, of_proven.noise_factor)
+        after = problem.fitting(of_proven, of_proven.noise_factor)
         # One of the two stands still, and each of its points had the record of what does.
         if not is_proof(record @ (after.astype(float) - before)):
             return of_most
-        return problem.near(of_proven.T_camera_world, of_proven.noise_factor)
+        return problem.near(of_proven, of_proven.noise_factor)
 
     def at(
         self, known: PoseEstimate, ids: NDArray[np.int32], observations: Observations
     ) -> PoseEstimate:
         """Return a pose as it is, and which of points `ids` (N,) fit it, be they ever so few."""
         problem = _Problem(self._camera, self._map.xyz_world[ids], observations, WHOLE)
-        return replace(known, inliers=problem.fitting(known.T_camera_world, known.noise_factor))
+        return replace(known, inliers=problem.fitting(known, known.noise_factor))
 
     def record(self, ids: NDArray[np.int32], T_camera_world: Array) -> Array:
         """Return the logarithm (N,) of the odds that points stand still: what n keyframes saw at
@@ -427,37 +469,45 @@ class Consensus:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Points (N, 3), their observations (N), and where these were looked for."""
+    """Points (N, 3), their observations (N), where these were looked for, and the variance (6,) of
+    the twist during the readout.
+    """
 
     camera: StereoCamera
     points: Array
     observations: Observations
     searched: Searched
+    roll_variance: Array | None = None
 
     def take(self, rows: NDArray[np.bool_]) -> _Problem:
         """Return the chosen ones."""
-        return _Problem(
-            self.camera, self.points[rows], self.observations.take(rows), self.searched.take(rows)
-        )
+        seen, searched = self.observations.take(rows), self.searched.take(rows)
+        return replace(self, points=self.points[rows], observations=seen, searched=searched)
 
     def refined(self, T_start: Array) -> PoseEstimate:
         """Return the pose that most agree with."""
         return refine_pose(
-            self.camera, T_start, self.points, self.observations, searched=self.searched
+            self.camera,
+            T_start,
+            self.points,
+            self.observations,
+            searched=self.searched,
+            roll_variance=self.roll_variance,
         )
 
-    def near(self, T_camera_world: Array, noise_factor: float) -> PoseEstimate:
+    def near(self, known: PoseEstimate, noise_factor: float) -> PoseEstimate:
         """Return a pose refined by what fits it; what does not is of something else, or wrong."""
-        near = self.fitting(T_camera_world, noise_factor)
-        found = self.take(near).refined(T_camera_world)
+        near = self.fitting(known, noise_factor)
+        found = self.take(near).refined(known.T_camera_world)
         inliers = np.zeros(len(self.points), bool)
         inliers[near] = found.inliers
         return replace(found, inliers=inliers)
 
-    def fitting(self, T_camera_world: Array, noise_factor: float) -> NDArray[np.bool_]:
+    def fitting(self, known: PoseEstimate, noise_factor: float) -> NDArray[np.bool_]:
         """Return which observations (N,) fit a pose."""
         seen = _Seen.of(self.camera, self.points, self.observations)
-        return np.asarray(seen.distances(T_camera_world)[1] <= noise_factor**2 * seen.limit)
+        _, chi2 = seen.distances(known.T_camera_world, known.roll)
+        return np.asarray(chi2 <= noise_factor**2 * seen.limit)
 
 
 def differ(a: PoseEstimate, b: PoseEstimate) -> bool:
