@@ -43,8 +43,8 @@ FITTING = 0.95
 GATE = 0.999
 """Probability with which what agrees is taken to agree, where a false alarm costs more."""
 
-ROLLED_SIGMA, ROLLED_FRAMES = np.array([1e-4, 1e-4]), 30
-"""Least standard deviation of the twist during the readout, in metres and radians: 0.05 px; and
+LEAST_ROLL, ROLLED_FRAMES = np.full(6, 1e-8), 30
+"""Least variance of the twist during the readout, m² and rad², that of a twentieth of a pixel; and
 frames that count for it."""
 
 MIN_DEPTH_M = 0.05
@@ -108,23 +108,19 @@ class RollingShutter:
     The twist from the first row to the last is unknown in each frame, and 0 on average; its
     variances, one of ways and one of turns, are estimated from those of the frames before
     (expectation maximisation). Of a camera that exposes all rows at once they become nothing.
+    variance: (6,) of the twist.
     """
 
     def __init__(self) -> None:
-        self._variance = ROLLED_SIGMA**2
-        self._count = 1.0
+        self.variance = LEAST_ROLL
+        self._count = 1
 
-    @property
-    def variance(self) -> Array:
-        """Of the twist (6,)."""
-        return np.repeat(self._variance, 3)
-
-    def learn(self, squared: Array) -> None:
-        """Take in the expected squares (6,) of the twist of a frame."""
+    def learn(self, squares: Array) -> None:
+        """Take in what the squares (6,) of the twist in a frame are expected to be."""
         self._count = min(self._count + 1, ROLLED_FRAMES)
-        seen = squared.reshape(2, 3).mean(axis=1)
-        self._variance = self._variance + (seen - self._variance) / self._count
-        self._variance = np.maximum(self._variance, ROLLED_SIGMA**2)
+        seen = np.repeat(squares.reshape(2, 3).mean(axis=1), 3)
+        known = self.variance + (seen - self.variance) / self._count
+        self.variance = np.maximum(known, LEAST_ROLL)
 
 
 def rolled(points: Array, share: Array, twist: Array) -> Array:

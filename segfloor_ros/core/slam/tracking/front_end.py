@@ -146,8 +146,7 @@ class FrontEnd:
             return None
         track = replace(track, sigma_m=sigma_m(track.covariance))
         T_seen = None if knows_less else track.T_camera_world
-        if track.estimate.rolled_squares is not None:
-            self._map.rig.shutter.learn(track.estimate.rolled_squares)
+        self._map.rig.shutter.learn(track.estimate.rolled_squares)
         track = self._weighed(replace(track, prior=prior))
         self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
         self.follower.see(images, track.point_ids, track.uv_px)

@@ -21,6 +21,7 @@ from segfloor_ros.core.contracts import UNKNOWN_COVARIANCE
 from segfloor_ros.core.geometry import Array, invert, make_transform, transform_points
 from segfloor_ros.core.least_squares import SHRINK, SMALLEST, minimise
 from segfloor_ros.core.slam.rig import (
+    LEAST_ROLL,
     MAX_DISPARITY_SHARE,
     MIN_DEPTH_M,
     SAME_PX,
@@ -120,7 +121,7 @@ class PoseEstimate:
     noise_factor: float
     log_ratio: float = 0.0
     roll: Array = field(default_factory=lambda: np.zeros(6))
-    rolled_squares: Array | None = None
+    rolled_squares: Array = field(default_factory=lambda: np.zeros(6))
 
     def evidence(self, expected: PoseEstimate | None = None) -> float:
         """Return how much the observations say for the pose. expected: where the camera was to be;
@@ -179,7 +180,7 @@ def refine_pose(
     searched: Searched = WHOLE,
     is_noise_known: bool = False,
     first: NDArray[np.bool_] | None = None,
-    roll_variance: Array | None = None,
+    roll_variance: Array = LEAST_ROLL,
 ) -> PoseEstimate:
     """Refine a pose by Levenberg-Marquardt on (u, v, d) with a Huber cost, dropping outliers
     between rounds.
@@ -190,14 +191,14 @@ def refine_pose(
     noise is known. prior: the pose by other sensors; it adds what the points do not determine.
     searched: where the matches were looked for. first: which (N,) agree with the pose at the start.
     roll_variance: (6,) of the twist during the readout, which is estimated, too (Hedborg et al.,
-    Rolling Shutter Bundle Adjustment, CVPR 2012); None for a camera without.
+    Rolling Shutter Bundle Adjustment, CVPR 2012).
     """
     seen = _Seen.of(camera, points_world, observations)
     inliers = np.ones(len(points_world), bool) if first is None else first
     if not len(points_world):
         unknown = PoseEstimate(T_camera_world, inliers, np.eye(6) * UNKNOWN_COVARIANCE, 1.0)
         return replace(prior or unknown, inliers=inliers)
-    known = replace(_Prior() if prior is None else _Prior.of(prior), roll_variance=roll_variance)
+    known = _Prior.of(prior, roll_variance)
     log_chance = searched.log_chance(camera, observations)
     mixture: Mixture | None = None
     pose, roll, factor = T_camera_world, np.zeros(6), 1.0
@@ -218,56 +219,43 @@ def refine_pose(
         return PoseEstimate(pose, inliers, np.eye(6) * UNKNOWN_COVARIANCE, factor)
     assert mixture is not None
     # Huber's weight of an inlier is 1.
-    J = seen.take(inliers).jacobian(rays[:, inliers], 1 / factor, roll_variance is not None)
+    J = seen.take(inliers).jacobian(rays[:, inliers], 1 / factor)
     H = J @ J.T
-    covariance = np.linalg.inv(H + known.all_information(np.eye(6) / UNKNOWN_COVARIANCE))
-    estimate = PoseEstimate(pose, inliers, covariance[:6, :6], factor, mixture.log_ratio)
-    if roll_variance is None:
-        return estimate
-    unlikely = gained(H[6:, 6:], np.diag(roll_variance)) + 0.5 * float(roll**2 @ (1 / roll_variance))
-    squares = roll**2 + np.diag(covariance)[6:]
-    ratio = mixture.log_ratio - unlikely
-    return replace(estimate, log_ratio=ratio, roll=roll, rolled_squares=squares)
+    covariance = np.linalg.inv(H + known.information + np.eye(12) / UNKNOWN_COVARIANCE)
+    unlikely = gained(H[6:, 6:], np.diag(roll_variance)) + 0.5 * float(
+        roll**2 @ (1 / roll_variance)
+    )
+    squares, ratio = roll**2 + np.diag(covariance)[6:], mixture.log_ratio - unlikely
+    return PoseEstimate(pose, inliers, covariance[:6, :6], factor, ratio, roll, squares)
 
 
 @dataclass(frozen=True)
 class _Prior:
-    """What is known of a pose before any point is seen, nothing by default. T_world_camera:
-    (4, 4). information: (6, 6) of the twist. roll_variance: (6,), None without a roll.
+    """What is known before any point is seen. T_world_camera: (4, 4), None where no pose is.
+    information: (12, 12) of the twist of the pose, and of that during the readout.
     """
 
-    T_world_camera: Array | None = None
-    information: Array | float = 0.0
-    roll_variance: Array | None = None
+    T_world_camera: Array | None
+    information: Array
 
     @staticmethod
-    def of(estimate: PoseEstimate) -> _Prior:
-        """Return what another estimate tells."""
-        return _Prior(invert(estimate.T_camera_world), np.linalg.inv(estimate.covariance))
+    def of(estimate: PoseEstimate | None, roll_variance: Array) -> _Prior:
+        """Return what another estimate tells, and the variance (6,) of the second twist."""
+        information = np.diag(np.append(np.zeros(6), 1 / roll_variance))
+        if estimate is None:
+            return _Prior(None, information)
+        information[:6, :6] = np.linalg.inv(estimate.covariance)
+        return _Prior(invert(estimate.T_camera_world), information)
 
-    def all_information(self, more: Array | float = 0.0) -> Array | float:
-        """Return that of pose and roll, (12, 12), or of the pose alone. more: (6, 6), of the pose."""
-        if self.roll_variance is None:
-            return self.information + more
-        known = np.zeros((12, 12))
-        known[:6, :6] = self.information + more
-        known[6:, 6:] = np.diag(1 / self.roll_variance)
-        return known
-
-    def at(self, T_camera_world: Array, roll: Array) -> tuple[Array | float, float]:
-        """Return the gradient (6,) or (12,) of half the squared error of a pose and a roll, and that
-        squared error.
+    def at(self, T_camera_world: Array, roll: Array) -> tuple[Array, float]:
+        """Return the gradient (12,) of half the squared error of a pose and of a twist during the
+        readout, and that squared error.
         """
-        gradient: Array | float = 0.0
-        strain = 0.0
-        if self.T_world_camera is not None:
-            error = se3_log(T_camera_world @ self.T_world_camera)
-            gradient = self.information @ error
-            strain = float(error @ gradient)
-        if self.roll_variance is None:
-            return gradient, strain
-        of_roll = roll / self.roll_variance
-        return np.append(np.zeros(6) + gradient, of_roll), strain + float(roll @ of_roll)
+        known = self.T_world_camera
+        error = np.zeros(6) if known is None else se3_log(T_camera_world @ known)
+        error = np.append(error, roll)
+        gradient = self.information @ error
+        return gradient, float(error @ gradient)
 
 
 @dataclass(frozen=True)
@@ -323,8 +311,7 @@ class _Seen:
         """
         rays = T_camera_world[:3, :3] @ self.rows[:3]
         rays += T_camera_world[:3, 3:]
-        if roll.any():
-            rays = rolled(rays, self.rows[11], roll)
+        rays = rolled(rays, self.rows[11], roll)
         inverse_z = 1.0 / np.maximum(rays[2], MIN_DEPTH_M)
         rays[:2] *= inverse_z
         rays[2] = inverse_z
@@ -340,16 +327,16 @@ class _Seen:
         chi2[rays[2] >= 1 / MIN_DEPTH_M] = 1e12
         return rays, chi2
 
-    def jacobian(self, rays: Array, root: Array | float, has_roll: bool) -> Array:
-        """Return the derivatives (6, 3 N) of what is seen along rays (3, N) by the twist of the
-        pose, in standard deviations times the roots (N,) of weights (Barfoot 2017, eq. 7.183); with
-        a roll (12, 3 N), also by that.
+    def jacobian(self, rays: Array, root: Array | float) -> Array:
+        """Return the derivatives (12, 3 N) of what is seen along rays (3, N) by the twists of the
+        pose and of the readout, in standard deviations times the roots (N,) of weights (Barfoot
+        2017, eq. 7.183).
         """
         x, y, inverse_z = rays
         by_z = self.rows[3:6] * root
         u, v = by_z[:2]
         along = by_z * rays
-        J: Array = np.zeros((6, *rays.shape))
+        J: Array = np.zeros((12, *rays.shape))
         np.multiply(u, inverse_z, out=J[0, 0])
         np.multiply(v, inverse_z, out=J[1, 1])
         np.multiply(along, -inverse_z, out=J[2])
@@ -359,9 +346,8 @@ class _Seen:
         J[4, 0] += u
         np.multiply(u, -y, out=J[5, 0])
         np.multiply(v, x, out=J[5, 1])
-        if has_roll:
-            J = np.concatenate([J, J * self.rows[11]])
-        return J.reshape(len(J), -1)
+        np.multiply(J[:6], self.rows[11], out=J[6:])
+        return J.reshape(12, -1)
 
 
 class _State:
@@ -382,19 +368,18 @@ class _State:
         """Return what solves the normal equations for a damping."""
         rays, residual, chi2 = self._view
         root = np.sqrt(huber_weights(chi2, self._seen.limit))
-        J = self._seen.jacobian(rays, root, self._prior.roll_variance is not None)
-        H, g = J @ J.T + self._prior.all_information(), J @ (residual * root).ravel() + self._pull
+        J = self._seen.jacobian(rays, root)
+        H, g = J @ J.T + self._prior.information, J @ (residual * root).ravel() + self._pull
 
         def stepped(damping: float) -> tuple[_State, float]:
             damped = H.copy()
-            diagonal = damped.ravel()[:: len(H) + 1]
+            diagonal = damped.ravel()[::13]
             diagonal += damping * (diagonal + 1e-9)
             step = np.linalg.solve(damped, -g)
             decrease = float(-g @ step)
             # What is predicted to gain too little to go on is not computed.
             cost = self.cost - decrease if decrease < CONVERGED * self.cost else None
-            roll = self.roll + step[6:] if len(step) > 6 else self.roll
-            pose = se3_exp(step[:6]) @ self.pose
+            pose, roll = se3_exp(step[:6]) @ self.pose, self.roll + step[6:]
             return _State(pose, roll, self._seen, self._prior, cost), SHRINK
 
         return stepped
@@ -452,7 +437,8 @@ class Consensus:
         self, known: PoseEstimate, ids: NDArray[np.int32], observations: Observations
     ) -> PoseEstimate:
         """Return a pose as it is, and which of points `ids` (N,) fit it, be they ever so few."""
-        problem = _Problem(self._camera, self._map.xyz_world[ids], observations, WHOLE)
+        variance = self._map.rig.shutter.variance
+        problem = _Problem(self._camera, self._map.xyz_world[ids], observations, WHOLE, variance)
         return replace(known, inliers=problem.fitting(known, known.noise_factor))
 
     def record(self, ids: NDArray[np.int32], T_camera_world: Array) -> Array:
@@ -477,7 +463,7 @@ class _Problem:
     points: Array
     observations: Observations
     searched: Searched
-    roll_variance: Array | None = None
+    roll_variance: Array
 
     def take(self, rows: NDArray[np.bool_]) -> _Problem:
         """Return the chosen ones."""

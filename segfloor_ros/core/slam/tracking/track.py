@@ -13,7 +13,6 @@ from segfloor_ros.core.slam.rig import Observations, Rig, in_view, rolled
 from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ
 
-
 FAR_PX = 0.1
 """Disparity of what is too far away for it to be measured."""
 
