@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.calibration import StereoCalibration
-from segfloor_ros.core.camera.pixels import Region, shrink_factor, shrunk_camera, shrunk_image
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.pixels import Region
+from segfloor_ros.core.camera.shrinking import shrunk_image
 from segfloor_ros.core.contracts import FrameResult, Keyframe, Mount, StereoFrame
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.slam.drift import DriftMeter
@@ -345,3 +347,26 @@ class SlamResults:
 
 def _faults_json(slam: StereoSlam) -> str:
     return json.dumps(slam.rig_check.as_dicts())
+
+
+SHRUNK_WIDTH_PX = 240
+
+
+def shrink_factor(camera: StereoCamera) -> int:
+    """Return by how much images of a camera are shrunk, at least 1."""
+    return max(1, round(camera.width / SHRUNK_WIDTH_PX))
+
+
+def shrunk_camera(camera: StereoCamera, factor: int) -> StereoCamera:
+    """Return the camera of shrunk images. Pixel centres are at whole numbers, so the principal
+    point moves by half a pixel less than the size.
+    """
+    return StereoCamera(
+        camera.width // factor,
+        camera.height // factor,
+        camera.fx / factor,
+        camera.fy / factor,
+        (camera.cx + 0.5) / factor - 0.5,
+        (camera.cy + 0.5) / factor - 0.5,
+        camera.baseline_m,
+    )

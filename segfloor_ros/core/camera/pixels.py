@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros import MAX_PIXELS
-from segfloor_ros.core.camera.model import StereoCamera, is_disparity
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import Array
 
@@ -47,8 +44,6 @@ SAME_SURFACE_SHARE = 0.05
 """Depths around a pixel that differ by more are those of two surfaces."""
 
 Disparity = NDArray[np.float32]
-
-SHRUNK_WIDTH_PX = 240
 
 
 def union(a: Region | None, b: Region | None) -> Region | None:
@@ -139,14 +134,6 @@ def shrunk(disparity: Disparity, size: tuple[int, int]) -> Disparity:
     return np.nan_to_num(small * np.float32(factor), nan=0.0).astype(np.float32)
 
 
-def shrunk_disparity(disparity: Disparity, factor: int) -> Disparity:
-    """Return the disparity at (H // factor, W // factor) in the pixels of the shrunk image."""
-    height, width = disparity.shape[0] // factor, disparity.shape[1] // factor
-    half = factor // 2
-    part = disparity[half::factor, half::factor][:height, :width]
-    return np.ascontiguousarray(part / np.float32(factor))
-
-
 def noise_grey(image: NDArray[np.uint8]) -> float:
     """Return the standard deviation of the image noise in grey levels.
 
@@ -157,52 +144,6 @@ def noise_grey(image: NDArray[np.uint8]) -> float:
     kernel = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
     response = cv2.filter2D(part, cv2.CV_16S, kernel)
     return float(np.median(np.abs(response[:, ::4]))) / 0.6745 / float(np.linalg.norm(kernel))
-
-
-def seen_from_right(left: NDArray[np.uint8], disparity: Disparity) -> NDArray[np.uint8]:
-    """Return the right image (H, W) as the virtual right camera would see it: what is nearer hides
-    what is farther; what no depth is known of is as in the left image.
-    """
-    right = left.copy()
-    rows, columns = np.nonzero(np.isfinite(disparity))
-    shift = disparity[rows, columns]
-    order = np.argsort(shift, kind='stable')
-    rows, columns = rows[order], columns[order]
-    target = np.rint(columns - shift[order]).astype(np.intp)
-    inside = target >= 0
-    right[rows[inside], target[inside]] = left[rows[inside], columns[inside]]
-    return right
-
-
-def shrink_factor(camera: StereoCamera) -> int:
-    """Return by how much images of a camera are shrunk, at least 1."""
-    return max(1, round(camera.width / SHRUNK_WIDTH_PX))
-
-
-def shrunk_image(image: NDArray[Any], factor: int) -> NDArray[Any]:
-    """Return an image (H, W) at (H // factor, W // factor), each pixel the mean of a square; of a
-    disparity, float32, one of its pixels.
-    """
-    if is_disparity(image):
-        return shrunk_disparity(image, factor)
-    height, width = image.shape[0] // factor, image.shape[1] // factor
-    whole = image[: height * factor, : width * factor]
-    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
-
-
-def shrunk_camera(camera: StereoCamera, factor: int) -> StereoCamera:
-    """Return the camera of shrunk images. Pixel centres are at whole numbers, so the principal
-    point moves by half a pixel less than the size.
-    """
-    return StereoCamera(
-        camera.width // factor,
-        camera.height // factor,
-        camera.fx / factor,
-        camera.fy / factor,
-        (camera.cx + 0.5) / factor - 0.5,
-        (camera.cy + 0.5) / factor - 0.5,
-        camera.baseline_m,
-    )
 
 
 Grey = NDArray[np.uint8] | NDArray[np.uint16]

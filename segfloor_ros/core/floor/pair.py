@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import is_disparity
-from segfloor_ros.core.camera.pixels import noise_grey, seen_from_right, union
+from segfloor_ros.core.camera.pixels import Disparity, noise_grey, union
 from segfloor_ros.core.contracts import MOVING, NO_EVIDENCE
 from segfloor_ros.core.floor.disparity.matching import equal_exposure
 from segfloor_ros.core.floor.disparity.profile import STEP_PX
@@ -149,3 +149,18 @@ def image_slope(image: NDArray[np.uint8]) -> NDArray[np.float32]:
     along = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8)
     # cv2.magnitude rounds by where its arrays lie in memory, so from run to run.
     return np.sqrt(across * across + along * along)
+
+
+def seen_from_right(left: NDArray[np.uint8], disparity: Disparity) -> NDArray[np.uint8]:
+    """Return the right image (H, W) as the virtual right camera would see it: what is nearer hides
+    what is farther; what no depth is known of is as in the left image.
+    """
+    right = left.copy()
+    rows, columns = np.nonzero(np.isfinite(disparity))
+    shift = disparity[rows, columns]
+    order = np.argsort(shift, kind='stable')
+    rows, columns = rows[order], columns[order]
+    target = np.rint(columns - shift[order]).astype(np.intp)
+    inside = target >= 0
+    right[rows[inside], target[inside]] = left[rows[inside], columns[inside]]
+    return right

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.camera.pixels import SUBPIXEL, shrunk, shrunk_image
+from segfloor_ros.core.camera.pixels import SUBPIXEL, shrunk
+from segfloor_ros.core.camera.shrinking import shrunk_image
 from segfloor_ros.core.contracts import RANGE_MAX_ERROR_M, SAME_SURFACE_SHARE, FloorScan, Mount
 from segfloor_ros.core.floor.disparity.matching import (
     COARSE_BLOCK_PX,

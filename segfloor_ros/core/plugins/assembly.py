@@ -14,6 +14,7 @@ from segfloor_ros.core.pipeline import KeyframeListener, KeyframeStages, Pipelin
 from segfloor_ros.core.plugins.maps.session import MapSession
 from segfloor_ros.core.plugins.moving.moving_regions import MovingRegions
 from segfloor_ros.core.plugins.rig.check import RigCheck
+from segfloor_ros.core.plugins.rig.image_check import ImageCheck
 from segfloor_ros.core.plugins.semantics.late_masks import LateMasks
 from segfloor_ros.core.plugins.semantics.network import ImageLabeller
 from segfloor_ros.core.plugins.semantics.semantic_map import SemanticMap
@@ -114,6 +115,7 @@ def equipped_slam(
         MovingRegions(camera) if settings.detect_moving else NothingMoves(),
         BodyMotion(),
         RigCheck(camera),
+        ImageCheck(),
         MapSession,
         LateMasks,
     )

@@ -148,6 +148,20 @@ class TrustedRig:
         return []
 
 
+class SoundImages:
+    """All images can be tracked. is_repeated: whether the last one is the one before. is_carried:
+    whether it should have moved since, so that it shows nothing of this moment.
+    """
+
+    is_repeated = is_carried = False
+
+    def fault(self, frame: StereoFrame, expected_shift: Callable[[], float]) -> str:
+        """Return why a frame cannot be tracked, ''. expected_shift: of the picture since the frame
+        before, in image widths.
+        """
+        return ''
+
+
 @dataclass
 class Plugins:
     """What is plugged into SLAM; by default nothing is."""
@@ -155,5 +169,6 @@ class Plugins:
     moving: MovingObjects = field(default_factory=NothingMoves)
     sensors: BodySensors = field(default_factory=NoSensors)
     rig_check: RigCheck = field(default_factory=TrustedRig)
+    image_check: SoundImages = field(default_factory=SoundImages)
     session: Callable[[Parts], OneMap] = OneMap
     late_masks: Callable[[FrontEnd, SparseMap], NoLateMasks] = NoLateMasks

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -51,9 +52,9 @@ class StereoSlam:
     once more, from the first one on.
     plugins: what it can do without. background: adjust the map on a thread beside tracking; a
     keyframe is then published before its adjustment, and results depend on timing. rig, map,
-    sensors: what is known of each. rig_check: what is wrong with the images. sessions: the
-    drives that made the map it goes on with. front_end, back_end: tracking and mapping. session:
-    which map the camera is in, and what results wait for.
+    sensors: what is known of each. rig_check, image_check: what is wrong with the images. sessions:
+    the drives that made the map it goes on with. front_end, back_end: tracking and mapping.
+    session: which map the camera is in, and what results wait for.
     late_masks: of keyframes, when they come. announce: where given, is called with the outcome
     of a frame that becomes a keyframe, in ROS frames, the frame and what moves in it, before
     the map has taken it in; only where results depend on timing.
@@ -75,6 +76,7 @@ class StereoSlam:
         self.sessions: list[dict[str, int]] = []
         self._times = times or StageTimes()
         self.sensors, self.rig_check = plugins.sensors, plugins.rig_check
+        self.image_check = plugins.image_check
         self.front_end = FrontEnd(settings, self.map, self.sensors)
         self.back_end = BackEnd(self.map, self.front_end, background)
         self._ground = GroundViews(self.rig)
@@ -111,8 +113,9 @@ class StereoSlam:
         """Track one frame and return the results that are ready, oldest first."""
         with self._times.measure('tracking'):
             self._take_in_changes()
-            fault = self.front_end.fault(frame)
-            if self.front_end.repeats.is_carried and not fault:
+            expected_shift = partial(self.front_end.expected_shift, frame.stamp_ns)
+            fault = self.image_check.fault(frame, expected_shift)
+            if self.image_check.is_carried and not fault:
                 return self.session.take(self._carried(frame))
             frame, images = self._prepared(frame, fault)
             track = self._track(frame, images, fault)
@@ -295,7 +298,7 @@ class StereoSlam:
             keyframe,
             blind=is_blind,
             in_submap=session.state.holds_results,
-            repeated=self.front_end.repeats.is_repeated,
+            repeated=self.image_check.is_repeated,
             outside=session.state is SessionState.OUTSIDE,
         )
 

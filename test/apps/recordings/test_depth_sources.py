@@ -29,10 +29,11 @@ from segfloor_ros.apps.recordings.bag_file import IMAGE, find_depth_topics
 from segfloor_ros.core.camera.calibration import EyeCalibration
 from segfloor_ros.core.camera.depth import VIRTUAL_BASELINE_M, depth_calibration, disparity_of_depth
 from segfloor_ros.core.camera.images import depth_image
-from segfloor_ros.core.camera.pixels import disparity_at, seen_from_right
+from segfloor_ros.core.camera.pixels import disparity_at
 from segfloor_ros.core.camera.rectification import StereoRectifier
 from segfloor_ros.core.camera.settings import StereoCameraSettings
 from segfloor_ros.core.errors import InputError, SegfloorError
+from segfloor_ros.core.floor.pair import seen_from_right
 
 SCALE = FX * VIRTUAL_BASELINE_M
 """Disparity times depth."""

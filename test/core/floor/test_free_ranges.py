@@ -7,11 +7,12 @@ import pytest
 from costmap import Costmap
 from stereo_room import CAMERA, MOUNT, ROOM_MAX, ROOM_MIN, StereoRoom, planar_pose
 
-from segfloor_ros.core.camera.pixels import shrink_factor, shrunk_camera, shrunk_image
+from segfloor_ros.core.camera.shrinking import shrunk_image
 from segfloor_ros.core.contracts import CELL_M, FloorScan
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.nodes.messages.scans import free_ranges, near_obstacles
+from segfloor_ros.nodes.slam_outputs import shrink_factor, shrunk_camera
 
 NAN, INF = float('nan'), float('inf')
 

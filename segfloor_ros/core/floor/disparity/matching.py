@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.camera.pixels import SUBPIXEL, shrunk_image
+from segfloor_ros.core.camera.pixels import SUBPIXEL
+from segfloor_ros.core.camera.shrinking import shrunk_image
 from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.geometry import Array
 

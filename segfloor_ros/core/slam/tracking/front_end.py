@@ -1,19 +1,14 @@
-"""The front end of SLAM: where the camera is, frame by frame, and which images cannot be tracked:
-black, white, only half delivered, or the same as before.
-"""
+"""The front end of SLAM: where the camera is, frame by frame."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.model import is_disparity
 from segfloor_ros.core.camera.pixels import Region, union
 from segfloor_ros.core.contracts import NO_POINT, BodySensors, LastPose, StereoFrame
 from segfloor_ros.core.geometry import Array, invert
@@ -39,16 +34,9 @@ from segfloor_ros.core.slam.tracking.map_tracking import (
     Tracker,
 )
 from segfloor_ros.core.slam.tracking.motion import CameraMotion, TrackingState, sigma_m
-from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ, refine_pose
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
-
-LIVE_ROWS = 0.6
-"""Share of the rows of an image that must show something: others were not delivered."""
-
-MIN_EXPECTED_SHIFT = 0.004
-"""Motion of the picture, in widths per frame, that cannot stop from one frame to the next."""
 
 
 class FrontEnd:
@@ -71,7 +59,6 @@ class FrontEnd:
         self.frames_since_keyframe = self.keyframe_ns = 0
         self._map = sparse_map
         self.relocaliser = Relocaliser(sparse_map, self.places)
-        self.repeats = RepeatCheck()
 
     @property
     def is_searching(self) -> bool:
@@ -113,18 +100,10 @@ class FrontEnd:
         self.local.drop_dead()
         self.follower.drop_dead()
 
-    @timed
-    def fault(self, frame: StereoFrame) -> str:
-        """Return why a pair of images cannot be tracked, or ''."""
-        motion, follower = self.motion, self.follower
-        frozen = self.repeats.is_frozen(
-            frame.left,
-            lambda: follower.expected_shift(motion.T_camera_world, motion.predict(frame.stamp_ns)),
-        )
-        fault = image_fault(frame.left, frame.left if is_disparity(frame.right) else frame.right)
-        if frozen and not fault:
-            return 'the image is again the one before although the camera was moving'
-        return fault
+    def expected_shift(self, stamp_ns: int) -> float:
+        """Return how far the picture should have moved since the last frame, in image widths."""
+        motion = self.motion
+        return self.follower.expected_shift(motion.T_camera_world, motion.predict(stamp_ns))
 
     def track(self, frame: StereoFrame, images: Images, found: Track | None = None) -> Track | None:
         """Find the pose of a frame: from the one before, else by its features. found: where
@@ -257,15 +236,8 @@ class FrontEnd:
         seen = track.observations.without_offset(rig.offset.value_px)
         seen = seen.with_noise_factor(by_images.noise_factor)
         points, start = self._map.xyz_world[track.point_ids], by_images.T_camera_world
-        found = refine_pose(
-            rig.camera,
-            start,
-            points,
-            seen,
-            prior,
-            is_noise_known=True,
-            roll_variance=rig.shutter.variance,
-        )
+        known = rig.camera, start, points, seen, prior
+        found = refine_pose(*known, is_noise_known=True, roll_variance=rig.shutter.variance)
         pose, covariance = found.T_camera_world, found.covariance
         weighed = replace(by_images, T_camera_world=pose, covariance=covariance)
         return replace(track, estimate=weighed)
@@ -358,45 +330,3 @@ def is_near(T_camera_world: Array, expected: PoseEstimate | None) -> bool:
     return expected is None or not differ(
         replace(expected, T_camera_world=T_camera_world), expected
     )
-
-
-def image_fault(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> str:
-    """Return what is wrong with a stereo pair of grey images (H, W), in words, or '' when it
-    can be tracked.
-    """
-    for side, image in (('left', left), ('right', right)):
-        sampled = np.ascontiguousarray(image[::4, ::4])
-        mean, spread = (float(value[0, 0]) for value in cv2.meanStdDev(sampled))
-        if spread < GREY_NOISE:
-            return f'{side} image without contrast (mean grey level {mean:.0f})'
-        live = (sampled != sampled[:, :1]).any(axis=1)
-        if live.mean() < LIVE_ROWS:
-            return f'{side} image incomplete: {1 - live.mean():.0%} of its rows are empty'
-    return ''
-
-
-class RepeatCheck:
-    """Distinguishes an image that a camera delivers twice, as a Kinect does, from a camera that is
-    frozen: it delivers the same one again and again. A robot that stands still shows the same view,
-    too, but then no motion was to be expected.
-
-    is_repeated: whether the last image is the one before. is_carried: whether its view should have
-    moved since, so that it shows nothing of this moment.
-    """
-
-    def __init__(self) -> None:
-        self._last: NDArray[np.uint8] | None = None
-        self.is_repeated = self.is_carried = self._is_frozen = False
-
-    def is_frozen(self, left: NDArray[np.uint8], expected_shift: Callable[[], float]) -> bool:
-        """Return whether the image (H, W) is the one before for a second time although it was to
-        move by expected_shift(), a share of its width, which is asked for only then.
-        """
-        was_carried = self.is_carried
-        self.is_repeated = self._last is not None and np.array_equal(left, self._last)
-        self._last = left
-        self._is_frozen &= self.is_repeated
-        should_move = self.is_repeated and expected_shift() > MIN_EXPECTED_SHIFT
-        self._is_frozen |= should_move and was_carried
-        self.is_carried = should_move and not self._is_frozen
-        return self._is_frozen

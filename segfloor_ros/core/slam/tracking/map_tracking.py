@@ -162,18 +162,9 @@ class Tracker:
         rows, ids = rows[estimate.inliers], ids[estimate.inliers]
         point_id = np.full(len(features), NO_POINT, np.int32)
         point_id[rows] = ids
-        return Track(
-            estimate,
-            ids,
-            observations.take(rows),
-            seen.ids,
-            ObservedFeatures(
-                features,
-                observations.with_noise_factor(estimate.noise_factor),
-                point_id,
-                estimate.roll,
-            ),
-        )
+        as_noisy = observations.with_noise_factor(estimate.noise_factor)
+        observed = ObservedFeatures(features, as_noisy, point_id, estimate.roll)
+        return Track(estimate, ids, observations.take(rows), seen.ids, observed)
 
     def locate(
         self, features: Features, ids: NDArray[np.int32], near: Array | None = None

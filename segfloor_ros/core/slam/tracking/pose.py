@@ -26,6 +26,7 @@ from segfloor_ros.core.slam.rig import (
     MIN_DEPTH_M,
     SAME_PX,
     Observations,
+    Rig,
     huber_cost,
     huber_weights,
     is_gated,
@@ -201,7 +202,8 @@ def refine_pose(
     known = _Prior.of(prior, roll_variance)
     log_chance = searched.log_chance(camera, observations)
     mixture: Mixture | None = None
-    pose, roll, factor = T_camera_world, np.zeros(6), 1.0
+    roll: Array = np.zeros(6)
+    pose, factor = T_camera_world, 1.0
     for _ in range(ROUNDS):
         best = minimise(_State(pose, roll, seen.take(inliers), known), STEPS_PER_ROUND, CONVERGED)
         pose, roll = best.pose, best.roll
@@ -309,9 +311,8 @@ class _Seen:
         in standard deviations, and their squares (N,); points that are behind the camera are just
         before it. roll: (6,) the twist during the readout.
         """
-        rays = T_camera_world[:3, :3] @ self.rows[:3]
-        rays += T_camera_world[:3, 3:]
-        rays = rolled(rays, self.rows[11], roll)
+        points = T_camera_world[:3, :3] @ self.rows[:3] + T_camera_world[:3, 3:]
+        rays = rolled(points, self.rows[11], roll)
         inverse_z = 1.0 / np.maximum(rays[2], MIN_DEPTH_M)
         rays[:2] *= inverse_z
         rays[2] = inverse_z
@@ -399,7 +400,6 @@ class Consensus:
 
     def __init__(self, sparse_map: SparseMap) -> None:
         self._map = sparse_map
-        self._camera = sparse_map.rig.camera
 
     @timed
     def refine(
@@ -414,8 +414,7 @@ class Consensus:
         looked for. known: the pose of the same image by other measurements.
         """
         points = self._map.xyz_world[ids]
-        variance = self._map.rig.shutter.variance
-        problem = _Problem(self._camera, points, observations, searched, variance)
+        problem = _Problem(self._map.rig, points, observations, searched)
         of_most = problem.refined(T_start)
         if known is not None and differ(of_most, known):
             return problem.near(known, known.noise_factor)
@@ -437,8 +436,7 @@ class Consensus:
         self, known: PoseEstimate, ids: NDArray[np.int32], observations: Observations
     ) -> PoseEstimate:
         """Return a pose as it is, and which of points `ids` (N,) fit it, be they ever so few."""
-        variance = self._map.rig.shutter.variance
-        problem = _Problem(self._camera, self._map.xyz_world[ids], observations, WHOLE, variance)
+        problem = _Problem(self._map.rig, self._map.xyz_world[ids], observations, WHOLE)
         return replace(known, inliers=problem.fitting(known, known.noise_factor))
 
     def record(self, ids: NDArray[np.int32], T_camera_world: Array) -> Array:
@@ -455,15 +453,12 @@ class Consensus:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Points (N, 3), their observations (N), where these were looked for, and the variance (6,) of
-    the twist during the readout.
-    """
+    """Points (N, 3), their observations (N), and where these were looked for."""
 
-    camera: StereoCamera
+    rig: Rig
     points: Array
     observations: Observations
     searched: Searched
-    roll_variance: Array
 
     def take(self, rows: NDArray[np.bool_]) -> _Problem:
         """Return the chosen ones."""
@@ -472,14 +467,9 @@ class _Problem:
 
     def refined(self, T_start: Array) -> PoseEstimate:
         """Return the pose that most agree with."""
-        return refine_pose(
-            self.camera,
-            T_start,
-            self.points,
-            self.observations,
-            searched=self.searched,
-            roll_variance=self.roll_variance,
-        )
+        camera, variance = self.rig.camera, self.rig.shutter.variance
+        seen = self.points, self.observations
+        return refine_pose(camera, T_start, *seen, searched=self.searched, roll_variance=variance)
 
     def near(self, known: PoseEstimate, noise_factor: float) -> PoseEstimate:
         """Return a pose refined by what fits it; what does not is of something else, or wrong."""
@@ -491,7 +481,7 @@ class _Problem:
 
     def fitting(self, known: PoseEstimate, noise_factor: float) -> NDArray[np.bool_]:
         """Return which observations (N,) fit a pose."""
-        seen = _Seen.of(self.camera, self.points, self.observations)
+        seen = _Seen.of(self.rig.camera, self.points, self.observations)
         _, chi2 = seen.distances(known.T_camera_world, known.roll)
         return np.asarray(chi2 <= noise_factor**2 * seen.limit)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,11 +39,8 @@ class ObservedFeatures:
 
     def take(self, rows: NDArray[np.intp]) -> ObservedFeatures:
         """Return the chosen rows."""
-        return replace(
-            self,
-            features=self.features.take(rows),
-            observations=self.observations.take(rows),
-            point_id=self.point_id[rows],
+        return ObservedFeatures(
+            self.features.take(rows), self.observations.take(rows), self.point_id[rows], self.roll
         )
 
     def unrolled(self, rig: Rig) -> Observations:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from segfloor_ros.core.geometry import make_transform
+from segfloor_ros.core.plugins.rig.image_check import ImageCheck, image_fault
 from segfloor_ros.core.slam.places.views import View, is_keyframe, novelty
-from segfloor_ros.core.slam.tracking.front_end import RepeatCheck, image_fault
 from segfloor_ros.core.twists import se3_exp
 
 STILL = np.eye(4)
@@ -64,7 +64,7 @@ def test_image_faults_are_named():
 
 def test_an_image_is_repeated_once_and_frozen_then_where_the_camera_was_moving():
     one, two = np.zeros((6, 8), np.uint8), np.ones((6, 8), np.uint8)
-    check = RepeatCheck()
+    check = ImageCheck()
 
     def see(image, shift):
         return check.is_frozen(image.copy(), lambda: shift), check.is_repeated, check.is_carried
