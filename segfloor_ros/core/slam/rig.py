@@ -43,9 +43,12 @@ FITTING = 0.95
 GATE = 0.999
 """Probability with which what agrees is taken to agree, where a false alarm costs more."""
 
+GLOBAL_SHUTTER = np.full(6, SMALLEST)
+"""Variance of the twist during the readout where all rows are exposed at once, m² and rad²."""
+
 LEAST_ROLL, ROLLED_FRAMES = np.full(6, 1e-8), 30
-"""Least variance of the twist during the readout, m² and rad², that of a twentieth of a pixel; and
-frames that count for it."""
+"""Least variance of that twist where it is not known, that of a twentieth of a pixel; and frames
+that count for it."""
 
 MIN_DEPTH_M = 0.05
 

@@ -8,6 +8,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.contracts import Mount, StereoFrame
 from segfloor_ros.core.plugins.maps.session import MapSession
+from segfloor_ros.core.plugins.rig.image_check import ImageCheck
 from segfloor_ros.core.slam.optional import NoSensors, NothingMoves, Plugins
 from segfloor_ros.core.slam.session import SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
@@ -52,7 +53,9 @@ def equipped() -> tuple[StereoSlam, Counter]:
         def reset_world(self) -> None:
             resets['world'] += 1
 
-    plugins = Plugins(moving=Moving(), sensors=Sensors(), session=MapSession)
+    plugins = Plugins(
+        moving=Moving(), sensors=Sensors(), image_check=ImageCheck(), session=MapSession
+    )
     slam = StereoSlam(CAMERA, SETTINGS, mount_meter=Meter(resets), plugins=plugins)
     resets.clear()
     return slam, resets

@@ -21,7 +21,7 @@ from segfloor_ros.core.contracts import UNKNOWN_COVARIANCE
 from segfloor_ros.core.geometry import Array, invert, make_transform, transform_points
 from segfloor_ros.core.least_squares import SHRINK, SMALLEST, minimise
 from segfloor_ros.core.slam.rig import (
-    LEAST_ROLL,
+    GLOBAL_SHUTTER,
     MAX_DISPARITY_SHARE,
     MIN_DEPTH_M,
     SAME_PX,
@@ -181,7 +181,7 @@ def refine_pose(
     searched: Searched = WHOLE,
     is_noise_known: bool = False,
     first: NDArray[np.bool_] | None = None,
-    roll_variance: Array = LEAST_ROLL,
+    roll_variance: Array = GLOBAL_SHUTTER,
 ) -> PoseEstimate:
     """Refine a pose by Levenberg-Marquardt on (u, v, d) with a Huber cost, dropping outliers
     between rounds.
