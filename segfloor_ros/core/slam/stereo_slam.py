@@ -257,8 +257,7 @@ class StereoSlam:
             ground=self._ground.take(frame.left),
         )
         uv_px = observed.observations.uvd_px[:, :2]
-        patches = sample_patches(images.left, uv_px).astype(np.uint8)
-        self.back_end.add(keyframe, patches)
+        self.back_end.add(keyframe, sample_patches(images.left, uv_px).astype(np.uint8))
         if searched is not None:
             self._moving.remember(keyframe, searched.disparity)
             ids = np.setdiff1d(self.front_end.local.point_ids, keyframe.point_id)
@@ -270,7 +269,7 @@ class StereoSlam:
         else:
             self.back_end.take_in(keyframe, images, self.sensors.up_world)
         self.front_end.continue_from(images, keyframe, uv_px)
-        return take_snapshot(self.map, keyframe, frame, images.moving)
+        return take_snapshot(self.map, keyframe, frame, images.moving, uv_px)
 
     def _result(
         self, frame: StereoFrame, track: Track | None, fault: str, keyframe: Keyframe | None

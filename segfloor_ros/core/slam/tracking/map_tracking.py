@@ -142,7 +142,8 @@ class Tracker:
             observations, excluded = features.observations, images.excluded
         else:
             observations, excluded = images, None
-        seen = predict_points(self._map, local_ids, T_camera_world, excluded)
+        roll = None if known is None else known.roll
+        seen = predict_points(self._map, local_ids, T_camera_world, excluded, roll)
         points, rows, area_px2 = self._search(features, seen, NARROW_PX)
         if len(rows) == 0:
             return None

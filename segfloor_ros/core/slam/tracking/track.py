@@ -47,8 +47,6 @@ class ObservedFeatures:
         """Return what a camera measures that reads all rows out at once; what has no disparity is
         taken to be far away.
         """
-        if not self.roll.any():
-            return self.observations
         seen, camera = self.observations, rig.camera
         disparity = np.nan_to_num(seen.uvd_px[:, 2] - rig.offset.value_px)
         depth = camera.disparity_times_depth / np.maximum(disparity, FAR_PX)
