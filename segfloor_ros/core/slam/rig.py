@@ -46,9 +46,13 @@ GATE = 0.999
 GLOBAL_SHUTTER = np.full(6, SMALLEST)
 """Variance of the twist during the readout where all rows are exposed at once, m² and rad²."""
 
-LEAST_ROLL, ROLLED_FRAMES = np.full(6, 1e-8), 30
-"""Least variance of that twist where it is not known, that of a twentieth of a pixel; and frames
+LEAST_ROLL, ROLLED_FRAMES = np.full(6, 1e-8), 10
+"""Least variance of that twist of a rolling shutter, that of a twentieth of a pixel; and frames
 that count for it."""
+
+READOUT_S, FIRST_RATE, SURE = 0.03, 0.1, 4.0
+"""How long a readout may take, by how much of a turn (rad/s) that counts, and how many standard
+deviations show one."""
 
 MIN_DEPTH_M = 0.05
 
@@ -110,20 +114,24 @@ class RollingShutter:
 
     The twist from the first row to the last is unknown in each frame, and 0 on average; its
     variances, one of ways and one of turns, are estimated from those of the frames before
-    (expectation maximisation). Of a camera that exposes all rows at once they become nothing.
-    variance: (6,) of the twist.
+    (expectation maximisation), once turns are seen to follow the camera's: what is bent for another
+    reason, as by a wrong calibration, does not. variance: (6,) of the twist.
     """
 
     def __init__(self) -> None:
-        self.variance = LEAST_ROLL
-        self._count = 1
+        self.variance = GLOBAL_SHUTTER
+        self._sums = FIRST_RATE**2 * np.array([1.0, 0.0, READOUT_S**2, FIRST_RATE**2])
 
-    def learn(self, squares: Array) -> None:
-        """Take in what the squares (6,) of the twist in a frame are expected to be."""
-        self._count = min(self._count + 1, ROLLED_FRAMES)
-        seen = np.repeat(squares.reshape(2, 3).mean(axis=1), 3)
-        known = self.variance + (seen - self.variance) / self._count
-        self.variance = np.maximum(known, LEAST_ROLL)
+    def learn(self, roll: Array, variance: Array, velocity: Array) -> None:
+        """Take in the twist (6,) in a frame, its variance, and how the camera moves per second."""
+        turn, known = velocity[3:], (1 - variance / self.variance)[3:]
+        seconds = float(turn @ roll[3:]) / max(float(turn**2 @ known), SMALLEST)
+        self._sums += (weight := float(turn @ turn)) * np.array([1.0, seconds, seconds**2, weight])
+        _, mean, square, of_weights = self._sums / self._sums[0]
+        sigma = np.sqrt(max(square - mean**2, 0.0) * of_weights / self._sums[0])
+        seen = np.repeat((roll**2 + variance).reshape(2, 3).mean(axis=1), 3)
+        latest = self.variance + (seen - self.variance) / ROLLED_FRAMES
+        self.variance = np.maximum(latest, LEAST_ROLL) if mean > SURE * sigma else GLOBAL_SHUTTER
 
 
 def rolled(points: Array, share: Array, twist: Array) -> Array:

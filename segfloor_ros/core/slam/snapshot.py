@@ -15,20 +15,14 @@ from segfloor_ros.core.contracts import (
     SparseCloud,
     StereoFrame,
 )
-from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 
 
 def take_snapshot(
-    sparse_map: SparseMap,
-    keyframe: KeyframeRecord,
-    frame: StereoFrame,
-    moving: Region | None,
-    uv_px: Array,
+    sparse_map: SparseMap, keyframe: KeyframeRecord, frame: StereoFrame, moving: Region | None
 ) -> Keyframe:
     """Copy the map as it is at a keyframe made of `frame`, in optical axes: the camera stands for
-    the base and frame `world` for `map` until `in_map` turns them. uv_px: (F, 2) of its features
-    in the image.
+    the base and frame `world` for `map` until `in_map` turns them.
     """
     point_id = keyframe.point_id.copy()
     xyz = np.full((len(point_id), 3), np.nan)
@@ -41,7 +35,7 @@ def take_snapshot(
         keyframe.T_world_camera,
         frame.left,
         frame.right,
-        KeyframeFeatures(uv_px.astype(np.float32), point_id, xyz),
+        KeyframeFeatures(keyframe.observations.uvd_px[:, :2].astype(np.float32), point_id, xyz),
         path_of(sparse_map.keyframes),
         cloud_of(sparse_map),
         moving,

@@ -125,9 +125,10 @@ class FrontEnd:
             return None
         track = replace(track, sigma_m=sigma_m(track.covariance))
         T_seen = None if knows_less else track.T_camera_world
-        self._map.rig.shutter.learn(track.estimate.rolled_squares)
         track = self._weighed(replace(track, prior=prior))
         self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
+        seen = track.estimate
+        self._map.rig.shutter.learn(seen.roll, seen.roll_variance, self.motion.velocity)
         self.follower.see(images, track.point_ids, track.uv_px)
         self.frame_to_frame.see(frame, images, track.estimate)
         if len(track.point_ids) == 0:

@@ -142,8 +142,7 @@ class Tracker:
             observations, excluded = features.observations, images.excluded
         else:
             observations, excluded = images, None
-        roll = None if known is None else known.roll
-        seen = predict_points(self._map, local_ids, T_camera_world, excluded, roll)
+        seen = predict_points(self._map, local_ids, T_camera_world, excluded)
         points, rows, area_px2 = self._search(features, seen, NARROW_PX)
         if len(rows) == 0:
             return None

@@ -57,8 +57,9 @@ class CameraMotion:
     (Mur-Artal et al., ORB-SLAM, 2015, section V-B).
 
     T_camera_world: the latest pose (4, 4). covariance: (6, 6) of its twist. T_world_odom: the
-    correction of the odometry; both frames are the camera's first pose. state: of the latest frame;
-    while it is lost, `T_camera_world` turns on as a gyroscope measures.
+    correction of the odometry; both frames are the camera's first pose. velocity: (6,) of the
+    twist, per second. state: of the latest frame; while it is
+    lost, `T_camera_world` turns on as a gyroscope measures.
     """
 
     def __init__(self, max_speed_mps: float, body: BodySensors) -> None:
@@ -72,7 +73,7 @@ class CameraMotion:
         self.covariance: Array = np.zeros((6, 6))
         self.T_world_odom: Array = np.eye(4)
         self.state = TrackingState.TRACKING
-        self._velocity: Array = np.zeros(6)
+        self.velocity: Array = np.zeros(6)
         self._last_stamp_ns = 0
         self._surprises = Surprises()
         self._heading_sigma_rad: float | None = None
@@ -109,9 +110,7 @@ class CameraMotion:
 
     def steady(self, stamp_ns: int) -> Array:
         """Return where the camera will be if it moves on as it did, T_camera_world (4, 4)."""
-        return (
-            se3_exp(self._velocity * _step_s(self._last_stamp_ns, stamp_ns)) @ self.T_camera_world
-        )
+        return se3_exp(self.velocity * _step_s(self._last_stamp_ns, stamp_ns)) @ self.T_camera_world
 
     def expected(self, stamp_ns: int) -> PoseEstimate | None:
         """Return where the camera will be: as wheels or an IMU measure, or if its motion goes on,
@@ -164,7 +163,7 @@ class CameraMotion:
             self.T_camera_world,
             self.T_world_odom,
             self.covariance,
-            self._velocity,
+            self.velocity,
             tuple(self._body.latest_wheels),
         )
 
@@ -175,7 +174,7 @@ class CameraMotion:
         self.lose()
         self.state = TrackingState.RESUMING
         self.T_camera_world, self.T_world_odom = last.T_camera_world, last.T_world_odom
-        self.covariance, self._velocity = last.covariance, last.velocity
+        self.covariance, self.velocity = last.covariance, last.velocity
         self._last_stamp_ns = last.stamp_ns
         self._broken_off = last, sigma_per_s
         for pose in last.wheels:
@@ -195,10 +194,10 @@ class CameraMotion:
             self.T_world_odom = without_drift(invert(T_camera_world) @ invert(T_odom_camera))
         motion = se3_log(T_camera_world @ invert(self.T_camera_world))
         steady = not (self.state.is_lost or self.state.is_blind)
-        if steady and self._velocity.any():
+        if steady and self.velocity.any():
             step_s = _step_s(self._last_stamp_ns, stamp_ns)
-            self._surprises.learn(motion - self._velocity * step_s, step_s)
-        self._velocity = motion / _step_s(self._last_stamp_ns, stamp_ns) if steady else np.zeros(6)
+            self._surprises.learn(motion - self.velocity * step_s, step_s)
+        self.velocity = motion / _step_s(self._last_stamp_ns, stamp_ns) if steady else np.zeros(6)
         self.since_keyframe.add(measured)
         self.T_camera_world, self.covariance = T_camera_world, covariance
         self._last_stamp_ns = stamp_ns
@@ -242,7 +241,7 @@ class CameraMotion:
             sigma_rad = sigma_rad if before.is_lost else 0.0
         is_near = stamp_ns is not None and before is not TrackingState.LOST
         self.state = TrackingState.LOST_NEAR if is_near else TrackingState.LOST
-        self._velocity = np.zeros(6)
+        self.velocity = np.zeros(6)
         self._heading_sigma_rad = self._latest = self.since_keyframe.motion = None
         self._body.reset()
         if stamp_ns is not None and turned is not None and sigma_rad is not None:

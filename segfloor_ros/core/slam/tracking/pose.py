@@ -112,8 +112,7 @@ class PoseEstimate:
     T_camera_world: (4, 4). inliers: (N,) bool over the observations. covariance: (6, 6) of the
     twist in T_camera_world <- exp(twist) T_camera_world, order translation (m), rotation (rad).
     log_ratio: of the likelihood of the observations over that of chance (see `evidence`). roll,
-    rolled_squares: (6,) the twist during the readout of the image, and what its squares are
-    expected to be.
+    roll_variance: (6,) the twist during the readout of the image, and its variance.
     """
 
     T_camera_world: Array
@@ -122,7 +121,7 @@ class PoseEstimate:
     noise_factor: float
     log_ratio: float = 0.0
     roll: Array = field(default_factory=lambda: np.zeros(6))
-    rolled_squares: Array = field(default_factory=lambda: np.zeros(6))
+    roll_variance: Array = field(default_factory=lambda: np.zeros(6))
 
     def evidence(self, expected: PoseEstimate | None = None) -> float:
         """Return how much the observations say for the pose. expected: where the camera was to be;
@@ -227,8 +226,8 @@ def refine_pose(
     unlikely = gained(H[6:, 6:], np.diag(roll_variance)) + 0.5 * float(
         roll**2 @ (1 / roll_variance)
     )
-    squares, ratio = roll**2 + np.diag(covariance)[6:], mixture.log_ratio - unlikely
-    return PoseEstimate(pose, inliers, covariance[:6, :6], factor, ratio, roll, squares)
+    ratio, left = mixture.log_ratio - unlikely, np.diag(covariance)[6:]
+    return PoseEstimate(pose, inliers, covariance[:6, :6], factor, ratio, roll, left)
 
 
 @dataclass(frozen=True)
