@@ -349,12 +349,9 @@ def _faults_json(slam: StereoSlam) -> str:
     return json.dumps(slam.rig_check.as_dicts())
 
 
-SHRUNK_WIDTH_PX = 240
-
-
-def shrink_factor(camera: StereoCamera) -> int:
-    """Return by how much images of a camera are shrunk, at least 1."""
-    return max(1, round(camera.width / SHRUNK_WIDTH_PX))
+def shrink_factor(camera: StereoCamera, width_px: int = 240) -> int:
+    """Return by how much images of a camera are shrunk to about a width, at least 1."""
+    return max(1, round(camera.width / width_px))
 
 
 def shrunk_camera(camera: StereoCamera, factor: int) -> StereoCamera:

@@ -46,9 +46,9 @@ GATE = 0.999
 GLOBAL_SHUTTER = np.full(6, SMALLEST)
 """Variance of the twist during the readout where all rows are exposed at once, m² and rad²."""
 
-LEAST_ROLL, ROLLED_FRAMES = np.full(6, 1e-8), 10
-"""Least variance of that twist of a rolling shutter, that of a twentieth of a pixel; and frames
-that count for it."""
+LEAST_ROLL, ROLLED_FRAMES = np.full(6, 1e-6), 10
+"""Least variance of that twist of a rolling shutter, that of half a pixel; and frames that count
+for it."""
 
 READOUT_S, FIRST_RATE, SURE = 0.03, 0.1, 4.0
 """How long a readout may take, by how much of a turn (rad/s) that counts, and how many standard
@@ -126,6 +126,7 @@ class RollingShutter:
         """Take in the twist (6,) in a frame, its variance, and how the camera moves per second."""
         turn, known = velocity[3:], (1 - variance / self.variance)[3:]
         seconds = float(turn @ roll[3:]) / max(float(turn**2 @ known), SMALLEST)
+        seconds = max(-SURE * READOUT_S, min(seconds, SURE * READOUT_S))
         self._sums += (weight := float(turn @ turn)) * np.array([1.0, seconds, seconds**2, weight])
         _, mean, square, of_weights = self._sums / self._sums[0]
         sigma = np.sqrt(max(square - mean**2, 0.0) * of_weights / self._sums[0])
