@@ -23,6 +23,7 @@ from segfloor_ros.core.camera.model import MAX_OFFSET_PX, OFFSET_SIGMA_PX, Stere
 from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.least_squares import SMALLEST
+from segfloor_ros.core.twists import skew
 
 LOCAL_KEYFRAMES = 10
 """Keyframes that move in a local adjustment, and adjustments that a keyframe takes part in: what is
@@ -125,9 +126,10 @@ class RollingShutter:
     def learn(self, roll: Array, variance: Array, velocity: Array) -> None:
         """Take in the twist (6,) in a frame, its variance, and how the camera moves per second."""
         turn, known = velocity[3:], (1 - variance / self.variance)[3:]
+        weight = float(turn @ turn)
         seconds = float(turn @ roll[3:]) / max(float(turn**2 @ known), SMALLEST)
         seconds = max(-SURE * READOUT_S, min(seconds, SURE * READOUT_S))
-        self._sums += (weight := float(turn @ turn)) * np.array([1.0, seconds, seconds**2, weight])
+        self._sums += weight * np.array([1.0, seconds, seconds**2, weight])
         _, mean, square, of_weights = self._sums / self._sums[0]
         sigma = np.sqrt(max(square - mean**2, 0.0) * of_weights / self._sums[0])
         seen = np.repeat((roll**2 + variance).reshape(2, 3).mean(axis=1), 3)
@@ -139,10 +141,7 @@ def rolled(points: Array, share: Array, twist: Array) -> Array:
     """Return points (3, N) of the camera as rows see them that are read out a share (N,) of the
     readout time later than the middle one, in which the camera moves by a twist (6,).
     """
-    x, y, z = points
-    a, b, c = twist[3:]
-    turned = np.stack([b * z - c * y, c * x - a * z, a * y - b * x])
-    return np.asarray(points + share * (twist[:3, None] + turned))
+    return np.asarray(points + share * (twist[:3, None] + skew(twist[3:]) @ points))
 
 
 @dataclass
