@@ -95,7 +95,8 @@ class FrameToFrame:
         range_px = max(SAME_PX, float(np.ptp(disparity))) if len(disparity) else None
         # What RANSAC takes for right lies within two standard deviations.
         searched = Searched(area_px2, range_px, largest_factor=SAME_PX / (2 * SIGMA_FLOW_PX))
-        moved = refine_pose(self._camera, start[0], points, seen, searched=searched, first=start[1])
+        asked = self._camera, start[0], points, seen, None, searched, False, start[1]
+        moved = refine_pose(*asked, self._rig.shutter.variance)
         # Seen from far away all points are in one place, where many a corner is.
         near = PoseEstimate(np.eye(4), moved.inliers, ANYWHERE, 1.0)
         if not is_proof(moved.evidence(near)):
