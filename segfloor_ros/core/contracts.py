@@ -8,7 +8,7 @@ gets. Stages import these and their own room, never one another.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal, Protocol
@@ -465,7 +465,7 @@ class BodySensors(Protocol):
         """How much later than those of the images the stamps of the sensors are."""
 
     @property
-    def latest_wheels(self) -> list[WheelPose]:
+    def latest_wheels(self) -> Sequence[WheelPose]:
         """The last poses that the wheels measured."""
 
     @property

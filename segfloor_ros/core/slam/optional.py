@@ -8,7 +8,7 @@ searches for a lost camera in the map of the drive alone.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,15 +19,12 @@ from segfloor_ros.core.camera.pixels import Region
 from segfloor_ros.core.contracts import (
     BodySensors,
     InputFault,
-    Measurement,
     Mount,
     MovingObjects,
     Placed,
-    RelativeMotion,
     RigCheck,
     Searched,
     StereoFrame,
-    Up,
     WheelPose,
 )
 from segfloor_ros.core.geometry import Array
@@ -75,24 +72,18 @@ class NoLateMasks:
         """Have none to remove."""
 
 
-class NoSensors:
-    """Neither wheels nor an IMU; what others remark is kept."""
+class NoSensors(BodySensors):
+    """Neither wheels nor an IMU: what the protocol does by itself, nothing. What others remark is
+    kept.
+    """
 
     lag_ns = 0
-    up_world: Up | None = None
+    latest_wheels: Sequence[WheelPose] = ()
 
     def __init__(self) -> None:
-        self.T_base_left: Array | None = None
+        self.T_base_left = None
         self.messages: dict[str, int] = {}
         self.remarks: dict[str, str] = {}
-        self.latest_wheels: list[WheelPose] = []
-
-    def up_camera(self, T_odom_camera: Array) -> Up | None:
-        """Return None."""
-        return None
-
-    def add(self, measurement: Measurement) -> None:
-        """Ignore it."""
 
     def remark(self, remarks: Mapping[str, str]) -> None:
         """Say each thing that seems wrong once."""
@@ -100,34 +91,6 @@ class NoSensors:
             if what not in self.remarks:
                 logger.warning('%s', remark)
             self.remarks[what] = remark
-
-    def turn(self, before_ns: int, now_ns: int) -> tuple[Array, float] | None:
-        """Return None."""
-        return None
-
-    def between(self, before_ns: int, now_ns: int) -> RelativeMotion | None:
-        """Return None."""
-        return None
-
-    def by_inertia(
-        self, before_ns: int, now_ns: int, T_odom_before: Array, R_world_odom: Array
-    ) -> RelativeMotion | None:
-        """Return None."""
-        return None
-
-    def learn(self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array) -> None:
-        """Learn nothing."""
-
-    def carry(
-        self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array, on_wheels: bool
-    ) -> None:
-        """Note nothing."""
-
-    def reset(self) -> None:
-        """Have nothing to forget."""
-
-    def reset_world(self) -> None:
-        """Have nothing to forget."""
 
 
 class TrustedRig:

@@ -12,6 +12,7 @@ of the error of (u, v), and smaller; (u, v, u_right) would not have that propert
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -44,16 +45,10 @@ FITTING = 0.95
 GATE = 0.999
 """Probability with which what agrees is taken to agree, where a false alarm costs more."""
 
-GLOBAL_SHUTTER = np.full(6, SMALLEST)
-"""Variance of the twist during the readout where all rows are exposed at once, m² and rad²."""
-
-LEAST_ROLL, ROLLED_FRAMES = np.full(6, 1e-6), 10
-"""Least variance of that twist of a rolling shutter, that of half a pixel; and frames that count
-for it."""
-
-READOUT_S, FIRST_RATE, SURE = 0.03, 0.1, 4.0
-"""How long a readout may take, by how much of a turn (rad/s) that counts, and how many standard
-deviations show one."""
+READOUT_S, BENT_S, MISFIT = 0.03, 1.0, 0.003
+"""How long the readout of a rolling shutter takes, as a standard deviation before one is seen; what
+shows in its place where something else bends images; and by how much, in m and rad, they always
+are."""
 
 MIN_DEPTH_M = 0.05
 
@@ -110,34 +105,65 @@ class DisparityOffset:
         self.estimate = OffsetEstimate(value_px, min(information, MEMORY_SIGMA_PX**-2))
 
 
-class RollingShutter:
-    """How far the camera moves while an image is read out row by row, as the drive shows it.
+@dataclass(frozen=True)
+class Readout:
+    """How the camera moves while an image is read out, from the first row to the last: a twist (6,)
+    and its variance (6,), in m and rad.
+    """
 
-    The twist from the first row to the last is unknown in each frame, and 0 on average; its
-    variances, one of ways and one of turns, are estimated from those of the frames before
-    (expectation maximisation), once turns are seen to follow the camera's: what is bent for another
-    reason, as by a wrong calibration, does not. variance: (6,) of the twist.
+    twist: Array
+    variance: Array
+
+
+AT_ONCE = Readout(np.zeros(6), np.full(6, SMALLEST))
+"""All rows are exposed in one moment: a global shutter."""
+
+
+class RollingShutter:
+    """How long an image takes to be read out row by row, as the drive shows it.
+
+    The camera goes on meanwhile, so the twist from the first row to the last is that time by the
+    velocity. A map that was made at one velocity is bent alike: what shows the time is how the
+    twist changes with the velocity. Three hypotheses compete by their evidence (of normal priors:
+    Kass and Raftery, Bayes Factors, JASA 1995): that all rows are exposed at once, that there is
+    such a time, and that something else bends images. seconds: of the readout. expected: in the
+    next image.
     """
 
     def __init__(self) -> None:
-        self.variance = GLOBAL_SHUTTER
-        self._sums = FIRST_RATE**2 * np.array([1.0, 0.0, READOUT_S**2, FIRST_RATE**2])
+        self.seconds, self.expected = 0.0, AT_ONCE
+        self._velocity_of_map: Array = np.zeros(6)
+        self._sums = np.array([READOUT_S**-2, 0.0, 0.0, 1.0])
 
-    def learn(self, roll: Array, variance: Array, velocity: Array) -> None:
-        """Take in the twist (6,) in a frame, its variance, and how the camera moves per second."""
-        turn, known = velocity[3:], (1 - variance / self.variance)[3:]
-        weight = float(turn @ turn)
-        seconds = float(turn @ roll[3:]) / max(float(turn**2 @ known), SMALLEST)
-        seconds = max(-SURE * READOUT_S, min(seconds, SURE * READOUT_S))
-        self._sums += weight * np.array([1.0, seconds, seconds**2, weight])
-        _, mean, square, of_weights = self._sums / self._sums[0]
-        sigma = np.sqrt(max(square - mean**2, 0.0) * of_weights / self._sums[0])
-        seen = np.repeat((roll**2 + variance).reshape(2, 3).mean(axis=1), 3)
-        latest = self.variance + (seen - self.variance) / ROLLED_FRAMES
-        self.variance = np.maximum(latest, LEAST_ROLL) if mean > SURE * sigma else GLOBAL_SHUTTER
+    def expect(self, velocity: Array, variance: Array) -> None:
+        """Note with which velocity (6,) the camera comes to the next image, in m/s and rad/s."""
+        self.expected = Readout(self.seconds * velocity, self.seconds**2 * variance + SMALLEST)
+
+    def see_keyframe(self, velocity: Array) -> None:
+        """Note with which velocity (6,) a keyframe was taken."""
+        self._velocity_of_map += (velocity - self._velocity_of_map) / LOCAL_KEYFRAMES
+
+    def learn(self, seen: Readout, velocity: Array) -> None:
+        """Take in what an image showed of the twist, and the velocity (6,) there."""
+        if not self._velocity_of_map.any():
+            self._velocity_of_map = velocity.copy()
+        change = velocity - self._velocity_of_map
+        certainty, known = 1 / seen.variance, 1 / self.expected.variance
+        information = np.maximum(certainty - known, SMALLEST)
+        measured = (certainty * seen.twist - known * self.expected.twist) / information
+        # Keyframes are freed of the twist as far as it was known.
+        measured += self.seconds * (change - velocity)
+        weight = 1 / (1 / information + MISFIT**2)
+        self._sums += *(weight @ np.stack([change**2, change * measured, measured**2], axis=1)), 6
+        total, by_time, squared, count = self._sums
+        seconds = by_time / total
+        variance_s2 = max(1.0, (squared - seconds * by_time) / count) / total
+        ratio = np.array([READOUT_S, BENT_S]) ** 2 / variance_s2
+        rolling, bent = (seconds**2 / variance_s2 * ratio / (1 + ratio) - np.log1p(ratio)) / 2
+        self.seconds = float(seconds * (rolling > max(math.log(GATE / (1 - GATE)), bent)))
 
 
-def rolled(points: Array, share: Array, twist: Array) -> Array:
+def moved_on(points: Array, share: Array, twist: Array) -> Array:
     """Return points (3, N) of the camera as rows see them that are read out a share (N,) of the
     readout time later than the middle one, in which the camera moves by a twist (6,).
     """

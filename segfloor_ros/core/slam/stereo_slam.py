@@ -248,7 +248,7 @@ class StereoSlam:
             motion.T_camera_world,
             observed.features,
             observed.features.octave,
-            observed.unrolled(self.rig),
+            observed.at_once(self.rig),
             self.map.living(observed.point_id),
             motion.since_keyframe.start(
                 motion.T_camera_world, observed.known_share * motion.covariance

@@ -109,7 +109,8 @@ class FrontEnd:
         """Find the pose of a frame: from the one before, else by its features. found: where
         it is in this map, as that was found while the camera was in a submap.
         """
-        expected = self.motion.expected(frame.stamp_ns)
+        expected, shutter = self.motion.expected(frame.stamp_ns), self._map.rig.shutter
+        shutter.expect(*self.motion.velocity_at(frame.stamp_ns))
         if found is not None:
             features = self.extractor.extract(frame.left, images.excluded)
             track = self._relocalise(images, features, frame.stamp_ns, found)
@@ -127,8 +128,7 @@ class FrontEnd:
         T_seen = None if knows_less else track.T_camera_world
         track = self._weighed(replace(track, prior=prior))
         self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
-        seen = track.estimate
-        self._map.rig.shutter.learn(seen.roll, seen.roll_variance, self.motion.velocity)
+        shutter.learn(track.estimate.readout, self.motion.velocity)
         self.follower.see(images, track.point_ids, track.uv_px)
         self.frame_to_frame.see(frame, images, track.estimate)
         if len(track.point_ids) == 0:
@@ -238,7 +238,7 @@ class FrontEnd:
         seen = seen.with_noise_factor(by_images.noise_factor)
         points, start = self._map.xyz_world[track.point_ids], by_images.T_camera_world
         known = rig.camera, start, points, seen, prior
-        found = refine_pose(*known, is_noise_known=True, roll_variance=rig.shutter.variance)
+        found = refine_pose(*known, is_noise_known=True, readout=rig.shutter.expected)
         pose, covariance = found.T_camera_world, found.covariance
         weighed = replace(by_images, T_camera_world=pose, covariance=covariance)
         return replace(track, estimate=weighed)
@@ -319,6 +319,7 @@ class FrontEnd:
 
     def continue_from(self, images: Images, keyframe: KeyframeRecord, uv_px: Array) -> None:
         """Track on from the points of a keyframe, old and new. uv_px: (F, 2) of its features."""
+        self._map.rig.shutter.see_keyframe(self.motion.velocity)
         rows = np.flatnonzero(keyframe.point_id != NO_POINT)
         ids = keyframe.point_id[rows]
         self.follower.see(images, ids, uv_px[rows])

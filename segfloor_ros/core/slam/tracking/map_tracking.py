@@ -29,7 +29,7 @@ from segfloor_ros.core.slam.rig import (
     NEIGHBOURS,
     Observations,
     in_view,
-    rolled,
+    moved_on,
 )
 from segfloor_ros.core.slam.sparse_map import Covisible, SparseMap, median_depth_m
 from segfloor_ros.core.slam.tracking.evidence import is_proof
@@ -163,7 +163,7 @@ class Tracker:
         point_id = np.full(len(features), NO_POINT, np.int32)
         point_id[rows] = ids
         as_noisy = observations.with_noise_factor(estimate.noise_factor)
-        observed = ObservedFeatures(features, as_noisy, point_id, estimate.roll)
+        observed = ObservedFeatures(features, as_noisy, point_id, estimate.readout.twist)
         return Track(estimate, ids, observations.take(rows), seen.ids, observed)
 
     def locate(
@@ -255,18 +255,18 @@ def predict_points(
     ids: NDArray[np.int32],
     T_camera_world: Array,
     excluded: Region | None = None,
-    roll: Array | None = None,
+    twist: Array | None = None,
 ) -> Prediction:
     """Project points (N,) into the image and keep those that a camera there should recognise:
     inside the image, from about the known direction, at a size the pyramid has, and not in a region
-    that is excluded. roll: (6,) the twist during the readout of the image.
+    that is excluded. twist: (6,) of the camera during the readout of the image.
     """
     camera = sparse_map.rig.camera
     points = transform_points(T_camera_world, sparse_map.xyz_world[ids])
     uvd, visible = in_view(camera, points)
-    if roll is not None:
+    if twist is not None:
         share = np.nan_to_num((uvd[:, 1] - camera.cy) / camera.height).clip(-0.5, 0.5)
-        uvd, visible = in_view(camera, rolled(points.T, share, roll).T)
+        uvd, visible = in_view(camera, moved_on(points.T, share, twist).T)
     visible[visible] = ~is_inside(excluded, uvd[visible, :2])
     ids, points, uvd = ids[visible], points[visible], uvd[visible]
     distance = np.sqrt((points**2).sum(axis=1))
@@ -469,7 +469,9 @@ class Follower:
         self, local_ids: NDArray[np.int32], known: PoseEstimate, excluded: Region | None
     ) -> Prediction:
         """Return points that should be seen, spread over the image, the often found first."""
-        seen = predict_points(self._map, local_ids, known.T_camera_world, excluded, known.roll)
+        seen = predict_points(
+            self._map, local_ids, known.T_camera_world, excluded, known.readout.twist
+        )
         if len(seen.ids) <= TRACKED_POINTS:
             return seen
         area = self._camera.width * self._camera.height

@@ -112,6 +112,14 @@ class CameraMotion:
         """Return where the camera will be if it moves on as it did, T_camera_world (4, 4)."""
         return se3_exp(self.velocity * _step_s(self._last_stamp_ns, stamp_ns)) @ self.T_camera_world
 
+    def velocity_at(self, stamp_ns: int) -> tuple[Array, Array]:
+        """Return the velocity (6,) of the camera in an image, in m/s and rad/s, and its variance,
+        as far as it changed so far.
+        """
+        step_s = _step_s(self._last_stamp_ns, stamp_ns)
+        motion = se3_log(self.predict(stamp_ns) @ invert(self.T_camera_world))
+        return motion / step_s, np.diag(self._surprises.covariance(step_s)) / step_s**2
+
     def expected(self, stamp_ns: int) -> PoseEstimate | None:
         """Return where the camera will be: as wheels or an IMU measure, or if its motion goes on,
         as far as it did so far; of a lost one by the gyroscope's turn. None where nothing is known.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,16 +21,17 @@ from segfloor_ros.core.contracts import UNKNOWN_COVARIANCE
 from segfloor_ros.core.geometry import Array, invert, make_transform, transform_points
 from segfloor_ros.core.least_squares import SHRINK, SMALLEST, minimise
 from segfloor_ros.core.slam.rig import (
-    GLOBAL_SHUTTER,
+    AT_ONCE,
     MAX_DISPARITY_SHARE,
     MIN_DEPTH_M,
     SAME_PX,
     Observations,
+    Readout,
     Rig,
     huber_cost,
     huber_weights,
     is_gated,
-    rolled,
+    moved_on,
 )
 from segfloor_ros.core.slam.sparse_map import SparseMap
 from segfloor_ros.core.slam.thresholds import PROOF
@@ -111,8 +112,8 @@ class PoseEstimate:
 
     T_camera_world: (4, 4). inliers: (N,) bool over the observations. covariance: (6, 6) of the
     twist in T_camera_world <- exp(twist) T_camera_world, order translation (m), rotation (rad).
-    log_ratio: of the likelihood of the observations over that of chance (see `evidence`). roll,
-    roll_variance: (6,) the twist during the readout of the image, and its variance.
+    log_ratio: of the likelihood of the observations over that of chance (see `evidence`).
+    readout: how the camera moves while the image is read out.
     """
 
     T_camera_world: Array
@@ -120,8 +121,7 @@ class PoseEstimate:
     covariance: Array
     noise_factor: float
     log_ratio: float = 0.0
-    roll: Array = field(default_factory=lambda: np.zeros(6))
-    roll_variance: Array = field(default_factory=lambda: np.zeros(6))
+    readout: Readout = AT_ONCE
 
     def evidence(self, expected: PoseEstimate | None = None) -> float:
         """Return how much the observations say for the pose. expected: where the camera was to be;
@@ -180,7 +180,7 @@ def refine_pose(
     searched: Searched = WHOLE,
     is_noise_known: bool = False,
     first: NDArray[np.bool_] | None = None,
-    roll_variance: Array = GLOBAL_SHUTTER,
+    readout: Readout = AT_ONCE,
 ) -> PoseEstimate:
     """Refine a pose by Levenberg-Marquardt on (u, v, d) with a Huber cost, dropping outliers
     between rounds.
@@ -190,7 +190,7 @@ def refine_pose(
     right and wrong matches shows by how much, and the bound on outliers follows it, unless the
     noise is known. prior: the pose by other sensors; it adds what the points do not determine.
     searched: where the matches were looked for. first: which (N,) agree with the pose at the start.
-    roll_variance: (6,) of the twist during the readout, which is estimated, too (Hedborg et al.,
+    readout: as expected; its twist is estimated, too (Hedborg et al.,
     Rolling Shutter Bundle Adjustment, CVPR 2012).
     """
     seen = _Seen.of(camera, points_world, observations)
@@ -198,15 +198,14 @@ def refine_pose(
     if not len(points_world):
         unknown = PoseEstimate(T_camera_world, inliers, np.eye(6) * UNKNOWN_COVARIANCE, 1.0)
         return replace(prior or unknown, inliers=inliers)
-    known = _Prior.of(prior, roll_variance)
+    known = _Prior.of(prior, readout)
     log_chance = searched.log_chance(camera, observations)
     mixture: Mixture | None = None
-    roll: Array = np.zeros(6)
-    pose, factor = T_camera_world, 1.0
+    pose, twist, factor = T_camera_world, readout.twist, 1.0
     for _ in range(ROUNDS):
-        best = minimise(_State(pose, roll, seen.take(inliers), known), STEPS_PER_ROUND, CONVERGED)
-        pose, roll = best.pose, best.roll
-        rays, chi2 = seen.distances(pose, roll)
+        best = minimise(_State(pose, twist, seen.take(inliers), known), STEPS_PER_ROUND, CONVERGED)
+        pose, twist = best.pose, best.twist
+        rays, chi2 = seen.distances(pose, twist)
         start = 1.0 if is_noise_known else math.sqrt(max(1.0, float(np.median(chi2 / seen.median))))
         mixture = Mixture.fit(
             chi2, seen.dimensions, log_chance, start, searched.missed, searched.largest_factor
@@ -223,38 +222,39 @@ def refine_pose(
     J = seen.take(inliers).jacobian(rays[:, inliers], 1 / factor)
     H = J @ J.T
     covariance = np.linalg.inv(H + known.information + np.eye(12) / UNKNOWN_COVARIANCE)
-    unlikely = gained(H[6:, 6:], np.diag(roll_variance)) + 0.5 * float(
-        roll**2 @ (1 / roll_variance)
-    )
-    ratio, left = mixture.log_ratio - unlikely, np.diag(covariance)[6:]
-    return PoseEstimate(pose, inliers, covariance[:6, :6], factor, ratio, roll, left)
+    unlikely = gained(H[6:, 6:], np.diag(readout.variance))
+    unlikely += 0.5 * float((twist - readout.twist) ** 2 @ (1 / readout.variance))
+    found = Readout(twist, np.diag(covariance)[6:])
+    ratio = mixture.log_ratio - unlikely
+    return PoseEstimate(pose, inliers, covariance[:6, :6], factor, ratio, found)
 
 
 @dataclass(frozen=True)
 class _Prior:
-    """What is known before any point is seen. T_world_camera: (4, 4), None where no pose is.
-    information: (12, 12) of the twist of the pose, and of that during the readout.
+    """What is known before any point is seen. T_world_camera: (4, 4), None where no pose is. twist:
+    (6,) during the readout. information: (12, 12) of the twist of the pose, and of that one.
     """
 
     T_world_camera: Array | None
+    twist: Array
     information: Array
 
     @staticmethod
-    def of(estimate: PoseEstimate | None, roll_variance: Array) -> _Prior:
-        """Return what another estimate tells, and the variance (6,) of the second twist."""
-        information = np.diag(np.append(np.zeros(6), 1 / roll_variance))
+    def of(estimate: PoseEstimate | None, readout: Readout) -> _Prior:
+        """Return what another estimate tells, and what is expected of the readout."""
+        information = np.diag(np.append(np.zeros(6), 1 / readout.variance))
         if estimate is None:
-            return _Prior(None, information)
+            return _Prior(None, readout.twist, information)
         information[:6, :6] = np.linalg.inv(estimate.covariance)
-        return _Prior(invert(estimate.T_camera_world), information)
+        return _Prior(invert(estimate.T_camera_world), readout.twist, information)
 
-    def at(self, T_camera_world: Array, roll: Array) -> tuple[Array, float]:
+    def at(self, T_camera_world: Array, twist: Array) -> tuple[Array, float]:
         """Return the gradient (12,) of half the squared error of a pose and of a twist during the
         readout, and that squared error.
         """
         known = self.T_world_camera
         error = np.zeros(6) if known is None else se3_log(T_camera_world @ known)
-        error = np.append(error, roll)
+        error = np.append(error, twist - self.twist)
         gradient = self.information @ error
         return gradient, float(error @ gradient)
 
@@ -305,13 +305,13 @@ class _Seen:
         """Return the chosen ones."""
         return self if columns.all() else _Seen(self.rows[:, columns])
 
-    def at(self, T_camera_world: Array, roll: Array) -> tuple[Array, Array, Array]:
+    def at(self, T_camera_world: Array, twist: Array) -> tuple[Array, Array, Array]:
         """Return rays (3, N) = (x / z, y / z, 1 / z) to the points at a pose, the residuals (3, N)
         in standard deviations, and their squares (N,); points that are behind the camera are just
-        before it. roll: (6,) the twist during the readout.
+        before it. twist: (6,) during the readout.
         """
         points = T_camera_world[:3, :3] @ self.rows[:3] + T_camera_world[:3, 3:]
-        rays = rolled(points, self.rows[11], roll)
+        rays = moved_on(points, self.rows[11], twist)
         inverse_z = 1.0 / np.maximum(rays[2], MIN_DEPTH_M)
         rays[:2] *= inverse_z
         rays[2] = inverse_z
@@ -319,11 +319,11 @@ class _Seen:
         residual -= self.rows[6:9]
         return rays, residual, np.einsum('an,an->n', residual, residual)
 
-    def distances(self, T_camera_world: Array, roll: Array) -> tuple[Array, Array]:
+    def distances(self, T_camera_world: Array, twist: Array) -> tuple[Array, Array]:
         """Return the rays (3, N) and the squared residuals (N,) of `at`; what is behind the camera
         fits nothing.
         """
-        rays, _, chi2 = self.at(T_camera_world, roll)
+        rays, _, chi2 = self.at(T_camera_world, twist)
         chi2[rays[2] >= 1 / MIN_DEPTH_M] = 1e12
         return rays, chi2
 
@@ -356,11 +356,11 @@ class _State:
     """
 
     def __init__(
-        self, pose: Array, roll: Array, seen: _Seen, prior: _Prior, cost: float | None = None
+        self, pose: Array, twist: Array, seen: _Seen, prior: _Prior, cost: float | None = None
     ) -> None:
-        self.pose, self.roll, self._seen, self._prior = pose, roll, seen, prior
+        self.pose, self.twist, self._seen, self._prior = pose, twist, seen, prior
         if cost is None:
-            self._view, (self._pull, strain) = seen.at(pose, roll), prior.at(pose, roll)
+            self._view, (self._pull, strain) = seen.at(pose, twist), prior.at(pose, twist)
             cost = huber_cost(self._view[2], seen.limit) + strain
         self.cost = cost
 
@@ -379,8 +379,8 @@ class _State:
             decrease = float(-g @ step)
             # What is predicted to gain too little to go on is not computed.
             cost = self.cost - decrease if decrease < CONVERGED * self.cost else None
-            pose, roll = se3_exp(step[:6]) @ self.pose, self.roll + step[6:]
-            return _State(pose, roll, self._seen, self._prior, cost), SHRINK
+            pose, twist = se3_exp(step[:6]) @ self.pose, self.twist + step[6:]
+            return _State(pose, twist, self._seen, self._prior, cost), SHRINK
 
         return stepped
 
@@ -466,9 +466,9 @@ class _Problem:
 
     def refined(self, T_start: Array) -> PoseEstimate:
         """Return the pose that most agree with."""
-        camera, variance = self.rig.camera, self.rig.shutter.variance
+        camera, readout = self.rig.camera, self.rig.shutter.expected
         seen = self.points, self.observations
-        return refine_pose(camera, T_start, *seen, searched=self.searched, roll_variance=variance)
+        return refine_pose(camera, T_start, *seen, searched=self.searched, readout=readout)
 
     def near(self, known: PoseEstimate, noise_factor: float) -> PoseEstimate:
         """Return a pose refined by what fits it; what does not is of something else, or wrong."""
@@ -481,7 +481,7 @@ class _Problem:
     def fitting(self, known: PoseEstimate, noise_factor: float) -> NDArray[np.bool_]:
         """Return which observations (N,) fit a pose."""
         seen = _Seen.of(self.rig.camera, self.points, self.observations)
-        _, chi2 = seen.distances(known.T_camera_world, known.roll)
+        _, chi2 = seen.distances(known.T_camera_world, known.readout.twist)
         return np.asarray(chi2 <= noise_factor**2 * seen.limit)
 
 

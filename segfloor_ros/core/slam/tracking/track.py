@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.slam.rig import Observations, Rig, in_view, rolled
+from segfloor_ros.core.slam.rig import Observations, Rig, in_view, moved_on
 from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate, differ
 
@@ -20,14 +20,14 @@ FAR_PX = 0.1
 @dataclass(frozen=True)
 class ObservedFeatures:
     """The features (F) of a frame as measured. observations: (F, 3) px, with a disparity where one
-    was measured. point_id: (F,) int32, the row of each feature's map point or `NO_POINT`. roll:
-    (6,) the twist of the camera during the readout.
+    was measured. point_id: (F,) int32, the row of each feature's map point or `NO_POINT`. twist:
+    (6,) of the camera during the readout.
     """
 
     features: Features
     observations: Observations
     point_id: NDArray[np.int32]
-    roll: Array = field(default_factory=lambda: np.zeros(6))
+    twist: Array = field(default_factory=lambda: np.zeros(6))
 
     @property
     def known_share(self) -> float:
@@ -40,10 +40,10 @@ class ObservedFeatures:
     def take(self, rows: NDArray[np.intp]) -> ObservedFeatures:
         """Return the chosen rows."""
         return ObservedFeatures(
-            self.features.take(rows), self.observations.take(rows), self.point_id[rows], self.roll
+            self.features.take(rows), self.observations.take(rows), self.point_id[rows], self.twist
         )
 
-    def unrolled(self, rig: Rig) -> Observations:
+    def at_once(self, rig: Rig) -> Observations:
         """Return what a camera measures that reads all rows out at once; what has no disparity is
         taken to be far away.
         """
@@ -52,7 +52,7 @@ class ObservedFeatures:
         depth = camera.disparity_times_depth / np.maximum(disparity, FAR_PX)
         points = camera.back_project(seen.uvd_px[:, :2], depth)
         share = (seen.uvd_px[:, 1] - camera.cy) / camera.height
-        at_once = rolled(points.T, -share, self.roll).T
+        at_once = moved_on(points.T, -share, self.twist).T
         moved = in_view(camera, at_once)[0] - in_view(camera, points)[0]
         return Observations(seen.uvd_px + np.nan_to_num(moved), seen.sigma_px)
 

@@ -71,11 +71,7 @@ def test_where_all_agree_the_pose_is_that_of_all(observers):
     alone = seen.take(ids)
     found = Consensus(sparse_map).refine(np.eye(4), ids, alone)
     of_all = refine_pose(
-        CAMERA,
-        np.eye(4),
-        sparse_map.xyz_world[ids],
-        alone,
-        roll_variance=sparse_map.rig.shutter.variance,
+        CAMERA, np.eye(4), sparse_map.xyz_world[ids], alone, readout=sparse_map.rig.shutter.expected
     )
     np.testing.assert_array_equal(found.T_camera_world, of_all.T_camera_world)
     np.testing.assert_array_equal(found.inliers, of_all.inliers)
