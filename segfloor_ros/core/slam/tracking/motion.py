@@ -124,9 +124,15 @@ class CameraMotion:
         """Return where the camera will be: as wheels or an IMU measure, or if its motion goes on,
         as far as it did so far; of a lost one by the gyroscope's turn. None where nothing is known.
         """
-        step_s = _step_s(self._last_stamp_ns, stamp_ns)
         if self.state.is_lost:
-            return self._expected_lost(stamp_ns)
+            turned = self._turned(stamp_ns)
+            if turned is None or self._heading_sigma_rad is None:
+                return None
+            sigma_rad = self._heading_sigma_rad + turned[1] + SAME[1] / 3
+            covariance = ANYWHERE.copy()
+            covariance[3:, 3:] = sigma_rad**2 * np.eye(3)
+            return _estimate(turned[0], covariance)
+        step_s = _step_s(self._last_stamp_ns, stamp_ns)
         measured = self.measured(stamp_ns)
         if measured is None:
             motion = self.steady(stamp_ns) @ invert(self.T_camera_world)
@@ -154,15 +160,6 @@ class CameraMotion:
         measured = None if self.state.is_lost else self.measured(stamp_ns)
         known = self.prior(stamp_ns) or measured
         return known is not None and knows_more(known.covariance, by_images)
-
-    def _expected_lost(self, stamp_ns: int) -> PoseEstimate | None:
-        turned = self._turned(stamp_ns)
-        if turned is None or self._heading_sigma_rad is None:
-            return None
-        sigma_rad = self._heading_sigma_rad + turned[1] + SAME[1] / 3
-        covariance = ANYWHERE.copy()
-        covariance[3:, 3:] = sigma_rad**2 * np.eye(3)
-        return _estimate(turned[0], covariance)
 
     def last_pose(self) -> LastPose:
         """Return what a drive that is broken off here goes on from."""
