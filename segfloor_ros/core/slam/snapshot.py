@@ -15,31 +15,30 @@ from segfloor_ros.core.contracts import (
     SparseCloud,
     StereoFrame,
 )
+from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 
 
 def take_snapshot(
-    sparse_map: SparseMap, keyframe: KeyframeRecord, frame: StereoFrame, moving: Region | None
+    sparse_map: SparseMap,
+    keyframe: KeyframeRecord,
+    frame: StereoFrame,
+    moving: Region | None,
+    uv_px: Array,
 ) -> Keyframe:
     """Copy the map as it is at a keyframe made of `frame`, in optical axes: the camera stands for
-    the base and frame `world` for `map` until `in_map` turns them.
+    the base and frame `world` for `map` until `in_map` turns them. uv_px: (F, 2), where the image
+    shows its features, which keyframes have freed of the readout.
     """
     point_id = keyframe.point_id.copy()
     xyz = np.full((len(point_id), 3), np.nan)
     known = point_id != NO_POINT
     xyz[known] = sparse_map.xyz_world[point_id[known]]
     point_id[known] = sparse_map.stable_id[point_id[known]]
-    return Keyframe(
-        frame.stamp_ns,
-        frame.index,
-        keyframe.T_world_camera,
-        frame.left,
-        frame.right,
-        KeyframeFeatures(keyframe.observations.uvd_px[:, :2].astype(np.float32), point_id, xyz),
-        path_of(sparse_map.keyframes),
-        cloud_of(sparse_map),
-        moving,
-    )
+    features = KeyframeFeatures(uv_px.astype(np.float32), point_id, xyz)
+    shown = frame.stamp_ns, frame.index, keyframe.T_world_camera, frame.left, frame.right
+    path, cloud = path_of(sparse_map.keyframes), cloud_of(sparse_map)
+    return Keyframe(*shown, features, path, cloud, moving)
 
 
 def path_of(keyframes: Sequence[KeyframeRecord]) -> KeyframePath:

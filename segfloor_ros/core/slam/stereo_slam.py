@@ -269,7 +269,7 @@ class StereoSlam:
         else:
             self.back_end.take_in(keyframe, images, self.sensors.up_world)
         self.front_end.continue_from(images, keyframe, uv_px)
-        return take_snapshot(self.map, keyframe, frame, images.moving)
+        return take_snapshot(self.map, keyframe, frame, images.moving, uv_px)
 
     def _result(
         self, frame: StereoFrame, track: Track | None, fault: str, keyframe: Keyframe | None

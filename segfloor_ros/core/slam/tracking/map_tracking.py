@@ -24,10 +24,12 @@ from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.places.views import View, is_keyframe, novelty, view_novelty, views_near
 from segfloor_ros.core.slam.rig import (
+    AT_ONCE,
     LOCAL_KEYFRAMES,
     MIN_DEPTH_M,
     NEIGHBOURS,
     Observations,
+    Readout,
     in_view,
     moved_on,
 )
@@ -142,6 +144,8 @@ class Tracker:
             observations, excluded = features.observations, images.excluded
         else:
             observations, excluded = images, None
+        # Those of keyframes are freed of the readout.
+        readout = self._map.rig.shutter.expected if isinstance(images, Images) else AT_ONCE
         seen = predict_points(self._map, local_ids, T_camera_world, excluded)
         points, rows, area_px2 = self._search(features, seen, NARROW_PX)
         if len(rows) == 0:
@@ -154,7 +158,7 @@ class Tracker:
         measured = observations.take(rows).without_offset(offset_px)
         missed, by_chance = len(seen.ids) - len(rows), NARROW_PX * FOUND_PER_PX
         searched = Searched(area_px2, range_of(images, measured), missed, by_chance)
-        estimate = self.consensus.refine(T_camera_world, ids, measured, searched, known)
+        estimate = self.consensus.refine(T_camera_world, ids, measured, searched, known, readout)
         if not is_proof(estimate.evidence(known)):
             if known is None:
                 return None
@@ -255,18 +259,18 @@ def predict_points(
     ids: NDArray[np.int32],
     T_camera_world: Array,
     excluded: Region | None = None,
-    twist: Array | None = None,
+    readout: Readout = AT_ONCE,
 ) -> Prediction:
     """Project points (N,) into the image and keep those that a camera there should recognise:
     inside the image, from about the known direction, at a size the pyramid has, and not in a region
-    that is excluded. twist: (6,) of the camera during the readout of the image.
+    that is excluded. readout: of the image.
     """
     camera = sparse_map.rig.camera
     points = transform_points(T_camera_world, sparse_map.xyz_world[ids])
     uvd, visible = in_view(camera, points)
-    if twist is not None:
+    if readout.twist.any():
         share = np.nan_to_num((uvd[:, 1] - camera.cy) / camera.height).clip(-0.5, 0.5)
-        uvd, visible = in_view(camera, moved_on(points.T, share, twist).T)
+        uvd, visible = in_view(camera, moved_on(points.T, share, readout.twist).T)
     visible[visible] = ~is_inside(excluded, uvd[visible, :2])
     ids, points, uvd = ids[visible], points[visible], uvd[visible]
     distance = np.sqrt((points**2).sum(axis=1))
@@ -469,9 +473,7 @@ class Follower:
         self, local_ids: NDArray[np.int32], known: PoseEstimate, excluded: Region | None
     ) -> Prediction:
         """Return points that should be seen, spread over the image, the often found first."""
-        seen = predict_points(
-            self._map, local_ids, known.T_camera_world, excluded, known.readout.twist
-        )
+        seen = predict_points(self._map, local_ids, known.T_camera_world, excluded, known.readout)
         if len(seen.ids) <= TRACKED_POINTS:
             return seen
         area = self._camera.width * self._camera.height

@@ -408,12 +408,14 @@ class Consensus:
         observations: Observations,
         searched: Searched = WHOLE,
         known: PoseEstimate | None = None,
+        readout: Readout | None = None,
     ) -> PoseEstimate:
         """Refine a pose by points `ids` (N,) and their observations (N). searched: where they were
-        looked for. known: the pose of the same image by other measurements.
+        looked for. known: the pose of the same image by other measurements. readout: as expected in
+        the image, by default the latest one.
         """
         points = self._map.xyz_world[ids]
-        problem = _Problem(self._map.rig, points, observations, searched)
+        problem = _Problem(self._map.rig, points, observations, searched, readout)
         of_most = problem.refined(T_start)
         if known is not None and differ(of_most, known):
             return problem.near(known, known.noise_factor)
@@ -458,6 +460,7 @@ class _Problem:
     points: Array
     observations: Observations
     searched: Searched
+    readout: Readout | None = None
 
     def take(self, rows: NDArray[np.bool_]) -> _Problem:
         """Return the chosen ones."""
@@ -466,7 +469,7 @@ class _Problem:
 
     def refined(self, T_start: Array) -> PoseEstimate:
         """Return the pose that most agree with."""
-        camera, readout = self.rig.camera, self.rig.shutter.expected
+        camera, readout = self.rig.camera, self.readout or self.rig.shutter.expected
         seen = self.points, self.observations
         return refine_pose(camera, T_start, *seen, searched=self.searched, readout=readout)
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.core.contracts import NO_POINT, StereoFrame
+from segfloor_ros.core.contracts import NO_POINT, FrameResult, StereoFrame
 from segfloor_ros.core.geometry import Array, invert, rotation_from_angles, transform_points
 from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.rig import (
@@ -21,6 +21,8 @@ from segfloor_ros.core.slam.rig import (
     moved_on,
 )
 from segfloor_ros.core.slam.settings import StereoSlamSettings
+from segfloor_ros.core.slam.sparse_map import features_of
+from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate, refine_pose
 from segfloor_ros.core.slam.tracking.track import ObservedFeatures
@@ -194,25 +196,58 @@ def pictures(room: StereoRoom, frame: int) -> StereoFrame:
     return StereoFrame(frame, whole.stamp_ns, left, right)
 
 
-def errors_of_steps(is_rolling: bool, monkeypatch: pytest.MonkeyPatch) -> tuple[Array, float]:
-    """Return by how much the ways between frames err, in m, and the readout in s."""
-    if not is_rolling:
-        monkeypatch.setattr(RollingShutter, 'learn', lambda self, *seen: None)
-    slam, room = equipped_slam(CAMERA, StereoSlamSettings(), MOUNT), StereoRoom()
-    results = [r for k in range(FRAMES) for r in slam.process(pictures(room, k))]
+def drive(room: StereoRoom) -> tuple[StereoSlam, list[FrameResult]]:
+    slam = equipped_slam(CAMERA, StereoSlamSettings(), MOUNT)
+    results = [result for k in range(FRAMES) for result in slam.process(pictures(room, k))]
     assert all(result.tracked for result in results)
+    slam.close()
+    return slam, results
+
+
+@pytest.fixture(scope='module')
+def driven() -> tuple[StereoSlam, list[FrameResult]]:
+    return drive(StereoRoom())
+
+
+def errors_of_steps(results: list[FrameResult]) -> Array:
+    """Return by how much the ways between later frames err, in m."""
     found = np.array([result.T_odom_base for result in results])[14:]
     true = np.array([shaken(k) for k in range(FRAMES)])[14:]
-    slam.close()
     steps, true_steps = (invert(T[:-1]) @ T[1:] for T in (found, true))
-    error_m = np.linalg.norm(steps[:, :3, 3] - true_steps[:, :3, 3], axis=1)
-    return error_m, slam.rig.shutter.seconds
+    return np.linalg.norm(steps[:, :3, 3] - true_steps[:, :3, 3], axis=1)
 
 
 def test_a_shaken_camera_with_a_rolling_shutter_is_tracked_as_well_as_one_without(
-    monkeypatch: pytest.MonkeyPatch,
+    driven: tuple[StereoSlam, list[FrameResult]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    error, seconds = errors_of_steps(True, monkeypatch)
-    without, _ = errors_of_steps(False, monkeypatch)
-    assert np.median(error) < 0.5 * np.median(without)
-    assert seconds == pytest.approx(READOUT / 30, rel=0.5)
+    slam, results = driven
+    monkeypatch.setattr(RollingShutter, 'learn', lambda self, *seen: None)
+    without = errors_of_steps(drive(StereoRoom())[1])
+    assert np.median(errors_of_steps(results)) < 0.5 * np.median(without)
+    assert slam.rig.shutter.seconds == pytest.approx(READOUT / 30, rel=0.5)
+
+
+def test_published_features_are_where_the_image_shows_them(
+    driven: tuple[StereoSlam, list[FrameResult]],
+) -> None:
+    slam, results = driven
+    published = [result.keyframe for result in results if result.keyframe is not None][-1]
+    (record,) = (k for k in slam.map.keyframes if k.stamp_ns == published.stamp_ns)
+    shown_px = published.features.uv_px
+    np.testing.assert_allclose(shown_px, record.features.uv_px, atol=3.0)
+    moved_px = np.linalg.norm(record.observations.uvd_px[:, :2] - shown_px, axis=1)
+    assert np.median(moved_px) > 1.0
+
+
+def test_a_keyframe_is_found_again_by_what_was_measured_in_it_whatever_the_camera_does(
+    driven: tuple[StereoSlam, list[FrameResult]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slam, _ = driven
+    keyframe = slam.map.keyframes[-1]
+    turning = Readout(np.array([0.0, 0.0, 0.0, 0.02, 0.05, 0.0]), np.full(6, 1e-8))
+    monkeypatch.setattr(slam.rig.shutter, 'expected', turning)
+    seen = keyframe.observations.exact()
+    features, pose = features_of(slam.map, keyframe), keyframe.T_camera_world
+    found = slam.front_end.tracker.track_at(seen, features, keyframe.seen_ids, pose)
+    assert found is not None
+    assert np.linalg.norm(se3_log(found.T_camera_world @ invert(pose))) < 0.005
