@@ -128,11 +128,12 @@ class FrontEnd:
         T_seen = None if knows_less else track.T_camera_world
         track = self._weighed(replace(track, prior=prior))
         self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
-        shutter.learn(track.estimate.readout, self.motion.velocity)
         self.follower.see(images, track.point_ids, track.uv_px)
         self.frame_to_frame.see(frame, images, track.estimate)
         if len(track.point_ids) == 0:
             self.motion.since_keyframe.see(track.T_camera_world, track.covariance)
+        else:
+            shutter.learn(track.estimate.readout, self.motion.velocity)
         self.local.move_to(track.point_ids, track.T_camera_world)
         if not self.is_fixed:
             self._map.points.note_tracking(track.visible_ids, track.point_ids)
