@@ -448,11 +448,9 @@ class MountViewer:
         depth is measured, which needs no texture.
         """
         # Matched at half the resolution two rows share a disparity: odd steps meet both alike.
-        size = self._camera.width * self._camera.height
-        step = max(2, round(math.sqrt(size / 2 / SAMPLES))) | 1
+        step = max(2, round(math.sqrt(self._camera.width * self._camera.height / 2 / SAMPLES))) | 1
         part = np.s_[step // 2 :: step, step // 2 :: step]
-        at = pixels_where(disparity[part] >= 1)
-        rows, columns = (step // 2 + step * index for index in at)
+        rows, columns = (step // 2 + step * index for index in pixels_where(disparity[part] >= 1))
         above, below = (
             disparity[np.clip(rows + by, 0, len(left) - 1), columns] for by in (-BLOCK_PX, BLOCK_PX)
         )
@@ -461,27 +459,26 @@ class MountViewer:
             return self._placed(rows, columns, disparity[rows, columns], np.ones(len(rows)), rise)
         row, column, found_px, sigma = refined(left, right, disparity, noise, (rows, columns))
         weight = 1.0 / (1.0 + (sigma / NOISE_PX) ** 2)
-        return self._placed(row, column, found_px, weight, rise)
+        return self._placed(row, column, found_px, weight, rise, is_matched=True)
 
     def bases(
         self, left: NDArray[np.uint8], disparity: NDArray[np.float32], enough: float
     ) -> Samples:
         """Return samples of where upright things stand on blank floor."""
         rows, columns, found_px = find_bases(left, disparity, enough)
-        weight = np.full(len(rows), _BASE_WEIGHT)
-        return self._placed(rows, columns, found_px, weight)
+        return self._placed(rows, columns, found_px, np.full(len(rows), _BASE_WEIGHT))
 
     def _placed(
         self,
         rows: NDArray[np.number],
         columns: NDArray[np.number],
-        disparity_px: NDArray[np.floating],
+        found_px: NDArray[np.floating],
         weight: Array,
         rise: Array | None = None,
+        is_matched: bool = False,
     ) -> Samples:
         uv_px = np.stack([columns, rows + self.first_row], axis=1).astype(np.float64)
-        found_px = disparity_px.astype(np.float64)
-        return Samples.of(self._camera, uv_px, found_px, weight, rise)
+        return Samples.of(self._camera, uv_px, found_px.astype(float), weight, rise, is_matched)
 
 
 def find_bases(

@@ -65,14 +65,16 @@ _AT_ONCE = 200
 @dataclass(frozen=True)
 class Samples:
     """Disparities of one frame: rays (N, 3), disparities (N,) in pixels, weights (N,). rise: (N,),
-    by how much disparities grow per row around the samples, NaN where that is not known.
-    disparity_m: fx * baseline. down: by how much rays change per row.
+    by how much disparities grow per row around the samples, NaN where that is not known. most_px:
+    (N,), the disparity from which on a sample is beyond the edge of the right image. disparity_m:
+    fx * baseline. down: by how much rays change per row.
     """
 
     rays: Array
     disparity_px: Array
     weight: Array
     rise: Array
+    most_px: Array
     disparity_m: float
     down: float
 
@@ -84,11 +86,16 @@ class Samples:
         disparity_px: Array,
         weight: Array,
         rise: Array | None = None,
+        is_matched: bool = False,
     ) -> Samples:
-        """Return the samples at pixels (N, 2)."""
+        """Return the samples at pixels (N, 2). is_matched: what only one eye sees is matched, too,
+        with something else.
+        """
         rays = camera.back_project(uv_px, np.ones(len(uv_px)))
         rise = np.full(len(uv_px), np.nan) if rise is None else rise
-        return cls(rays, disparity_px, weight, rise, camera.disparity_times_depth, 1.0 / camera.fy)
+        most = uv_px[:, 0] if is_matched else np.full(len(uv_px), np.inf)
+        scale = camera.disparity_times_depth, 1.0 / camera.fy
+        return cls(rays, disparity_px, weight, rise, most, *scale)
 
     def every(self, step: int) -> Samples:
         """Return only one of every so many, which weighs as much as these."""
@@ -109,9 +116,8 @@ class Samples:
     def near(self, angles_height: Array) -> Samples:
         """Return only those that matter where a plane, (3,), is refined that is nearly known."""
         error, _, visible = _seen(self, plane_of(angles_height)[None])
-        return self.take(
-            np.flatnonzero(visible[:, 0] & (np.abs(error[:, 0]) < 2 * FINER_SCALES_PX[0]))
-        )
+        is_near = visible[:, 0] & (np.abs(error[:, 0]) < 2 * FINER_SCALES_PX[0])
+        return self.take(np.flatnonzero(is_near))
 
     def weight_on(self, plane: Array) -> Array:
         """Return the weights (N,) for a plane (3,): little where disparities do not rise down the
@@ -122,7 +128,7 @@ class Samples:
         return self.weight * np.where(rises, 1.0, _FLAT_WEIGHT)
 
 
-_OF_EACH = ('rays', 'disparity_px', 'weight', 'rise')
+_OF_EACH = ('rays', 'disparity_px', 'weight', 'rise', 'most_px')
 """What `Samples` have of each pixel."""
 LOOKS = 4
 """By so many frames it is seen how much a plane varies."""
@@ -221,12 +227,12 @@ def plausible(angles_height: Array) -> NDArray[np.bool_]:
 
 def _seen(samples: Samples, planes: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return of each sample and each plane m (M, 3) by how much its disparity exceeds the plane's,
-    how much less than that lies clearly below the plane, and whether it is visible there at all,
-    each (N, M).
+    how much less than that lies clearly below the plane, and whether both eyes see it there at
+    all, each (N, M).
     """
     scaled = (-samples.disparity_m * planes).astype(np.float32)
     expected = samples.rays.astype(np.float32) @ scaled.T
-    visible = expected > SAME_PX
+    visible = (expected > SAME_PX) & (expected < samples.most_px[:, None])
     error = samples.disparity_px[:, None].astype(np.float32) - expected
     expected *= np.float32(-_BEND)
     expected -= np.float32(2 * SAME_PX)
@@ -253,9 +259,8 @@ def shares(samples: Samples, angles_height: Array) -> tuple[float, float]:
     """Return which share of the weight of the samples where a plane, (3,), is visible lies on it,
     and which below it.
     """
-    error, limit, visible = (
-        column[:, 0] for column in _seen(samples, plane_of(angles_height)[None])
-    )
+    seen = _seen(samples, plane_of(angles_height)[None])
+    error, limit, visible = (column[:, 0] for column in seen)
     weight = np.where(visible, samples.weight, 0)
     total = float(weight.sum())
     if total == 0:

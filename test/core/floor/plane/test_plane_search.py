@@ -10,11 +10,18 @@ from segfloor_ros.core.camera.model import OFFSET_SIGMA_PX, StereoCamera
 from segfloor_ros.core.contracts import Mount, Up
 from segfloor_ros.core.floor.disparity.matching import BLOCK_PX, refined
 from segfloor_ros.core.floor.plane.mount import MountViewer, PlaneSearch, level_prior
-from segfloor_ros.core.floor.plane.plane import LEVEL_SIGMA, PlaneFit, Samples, plane_of, refine
+from segfloor_ros.core.floor.plane.plane import (
+    LEVEL_SIGMA,
+    PlaneFit,
+    Samples,
+    plane_of,
+    refine,
+    shares,
+)
 from segfloor_ros.core.twists import se3_exp
 
 UNKNOWN, STILL = np.full(3, np.nan), np.zeros((0, 3))
-NOTHING = Samples(np.zeros((0, 3)), *np.zeros((3, 0)), 1.0, 0.0)
+NOTHING = Samples(np.zeros((0, 3)), *np.zeros((4, 0)), 1.0, 0.0)
 DISPARITY_M = 40.0
 CAMERA = StereoCamera(320, 240, 160.0, 160.0, 159.5, 119.5, 0.25)
 VGA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.25)
@@ -22,9 +29,11 @@ TRUE = np.array([0.3, 0.0, 0.5])
 """Pitch, roll and height of the camera."""
 
 
-def weighing_alike(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights (N,) of samples, and how their disparities grow, which is not known."""
-    return np.ones(count), np.full(count, np.nan)
+def weighing_alike(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return weights (N,) of samples, how their disparities grow, which is not known, and that all
+    disparities would be seen.
+    """
+    return np.ones(count), np.full(count, np.nan), np.full(count, np.inf)
 
 
 def little_floor(seed: int) -> Samples:
@@ -89,7 +98,7 @@ def test_what_stands_far_away_does_not_tilt_the_floor(rises_are_known: bool) -> 
     disparity[is_thing] += 1.5
     rise = np.where(is_thing, 0.0, slope) if rises_are_known else np.full(len(rays), np.nan)
     weight = np.where(is_thing, 4.0, 1.0)
-    frame = Samples(rays, disparity, weight, rise, DISPARITY_M, down)
+    frame = Samples(rays, disparity, weight, rise, np.full(900, np.inf), DISPARITY_M, down)
     height_m = found([frame] * 4, None)[2]
     assert (abs(height_m - 0.5) < 0.01) == rises_are_known
 
@@ -135,7 +144,8 @@ def test_how_a_plane_is_known() -> None:
     unsure = np.array([0.5, 0.5, 1.0])
 
     def fit(disparity: np.ndarray, rise: np.ndarray) -> PlaneFit:
-        frame = Samples(rays, disparity, np.ones(3000), rise, DISPARITY_M, down)
+        seen = np.full(3000, np.inf)
+        frame = Samples(rays, disparity, np.ones(3000), rise, seen, DISPARITY_M, down)
         return refine(Samples.joined([frame] * 20), TRUE, UNKNOWN, STILL, TRUE, unsure)
 
     exact, off = fit(true_px, rise), fit(true_px + OFFSET_SIGMA_PX, rise)
@@ -238,3 +248,24 @@ def test_samples_lie_on_even_and_odd_rows_alike() -> None:
     disparity = np.full(image.shape, 12.0, np.float32)
     samples = MountViewer(VGA).surfaces(image, image, disparity, None)
     assert np.mean(np.rint(rows_of(samples, VGA)) % 2) == pytest.approx(0.5, abs=0.05)
+
+
+def test_what_only_one_eye_sees_of_the_floor_is_no_hole_in_it() -> None:
+    """At the left of the image the near floor is beyond the edge of the right one: what is matched
+    there is something else.
+    """
+    rng = np.random.default_rng(4)
+    uv_px = rng.uniform((0, 260), (640, 480), (3000, 2))
+    camera = StereoCamera(640, 480, 400.0, 400.0, 319.5, 239.5, 0.12)
+    rays = camera.back_project(uv_px, np.ones(3000))
+    level = np.array([0.1, 0.0, 0.25])
+    true_px = -camera.disparity_times_depth * rays @ plane_of(level)
+    hidden = true_px > uv_px[:, 0]
+    seen_px = np.where(hidden, rng.uniform(1.0, 0.6 * true_px), true_px)
+    assert hidden.mean() > 0.1
+    support, below = (
+        shares(Samples.of(camera, uv_px, seen_px, np.ones(3000), None, is_matched), level)
+        for is_matched in (True, False)
+    )
+    assert support == (1.0, 0.0)
+    assert below[1] > 0.1
