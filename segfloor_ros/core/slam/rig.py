@@ -136,7 +136,7 @@ class RollingShutter:
         self._sums = np.array([READOUT_S**-2, 0.0, 0.0, 1.0])
 
     def expect(self, velocity: Array, variance: Array) -> None:
-        """Note with which velocity (6,) the camera comes to the next image, in m/s and rad/s."""
+        """Note the velocity (6,) in the next image, in m/s and rad/s, and its variance (6,)."""
         self.expected = Readout(self.seconds * velocity, self.seconds**2 * variance + SMALLEST)
 
     def see_keyframe(self, velocity: Array) -> None:

@@ -96,7 +96,7 @@ class FrameToFrame:
         # What RANSAC takes for right lies within two standard deviations.
         searched = Searched(area_px2, range_px, largest_factor=SAME_PX / (2 * SIGMA_FLOW_PX))
         asked = self._camera, start[0], points, seen, None, searched, False, start[1]
-        # Both images were read out, in much the same motion.
+        # Both images are bent by much the same motion: only the difference is left.
         moved = refine_pose(*asked, replace(self._rig.shutter.expected, twist=np.zeros(6)))
         # Seen from far away all points are in one place, where many a corner is.
         near = PoseEstimate(np.eye(4), moved.inliers, ANYWHERE, 1.0)

@@ -144,7 +144,7 @@ class Tracker:
             observations, excluded = features.observations, images.excluded
         else:
             observations, excluded = images, None
-        # Those of keyframes are freed of the readout.
+        # What was measured in a keyframe is freed of the readout already.
         readout = self._map.rig.shutter.expected if isinstance(images, Images) else AT_ONCE
         seen = predict_points(self._map, local_ids, T_camera_world, excluded)
         points, rows, area_px2 = self._search(features, seen, NARROW_PX)
