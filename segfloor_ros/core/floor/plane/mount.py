@@ -459,7 +459,7 @@ class MountViewer:
             return self._placed(rows, columns, disparity[rows, columns], np.ones(len(rows)), rise)
         row, column, found_px, sigma = refined(left, right, disparity, noise, (rows, columns))
         weight = 1.0 / (1.0 + (sigma / NOISE_PX) ** 2)
-        return self._placed(row, column, found_px, weight, rise, is_matched=True)
+        return self._placed(row, column, found_px, weight, rise, self._matcher.num_disparities)
 
     def bases(
         self, left: NDArray[np.uint8], disparity: NDArray[np.float32], enough: float
@@ -475,10 +475,10 @@ class MountViewer:
         found_px: NDArray[np.floating],
         weight: Array,
         rise: Array | None = None,
-        is_matched: bool = False,
+        searched_px: float = math.inf,
     ) -> Samples:
         uv_px = np.stack([columns, rows + self.first_row], axis=1).astype(np.float64)
-        return Samples.of(self._camera, uv_px, found_px.astype(float), weight, rise, is_matched)
+        return Samples.of(self._camera, uv_px, found_px.astype(float), weight, rise, searched_px)
 
 
 def find_bases(

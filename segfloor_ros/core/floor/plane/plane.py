@@ -66,8 +66,8 @@ _AT_ONCE = 200
 class Samples:
     """Disparities of one frame: rays (N, 3), disparities (N,) in pixels, weights (N,). rise: (N,),
     by how much disparities grow per row around the samples, NaN where that is not known. most_px:
-    (N,), the disparity from which on a sample is beyond the edge of the right image. disparity_m:
-    fx * baseline. down: by how much rays change per row.
+    (N,), the disparity from which on a sample is beyond the edge of the right image, or not looked
+    for. disparity_m: fx * baseline. down: by how much rays change per row.
     """
 
     rays: Array
@@ -86,14 +86,15 @@ class Samples:
         disparity_px: Array,
         weight: Array,
         rise: Array | None = None,
-        is_matched: bool = False,
+        searched_px: float = math.inf,
     ) -> Samples:
-        """Return the samples at pixels (N, 2). is_matched: what only one eye sees is matched, too,
-        with something else.
+        """Return the samples at pixels (N, 2). searched_px: the largest disparity that a matcher
+        tried: what is nearer, or seen by one eye alone, it matches with something else.
         """
         rays = camera.back_project(uv_px, np.ones(len(uv_px)))
         rise = np.full(len(uv_px), np.nan) if rise is None else rise
-        most = uv_px[:, 0] if is_matched else np.full(len(uv_px), np.inf)
+        is_all = math.isinf(searched_px)
+        most = np.full(len(uv_px), np.inf) if is_all else np.minimum(uv_px[:, 0], searched_px)
         scale = camera.disparity_times_depth, 1.0 / camera.fy
         return cls(rays, disparity_px, weight, rise, most, *scale)
 
@@ -227,7 +228,7 @@ def plausible(angles_height: Array) -> NDArray[np.bool_]:
 
 def _seen(samples: Samples, planes: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return of each sample and each plane m (M, 3) by how much its disparity exceeds the plane's,
-    how much less than that lies clearly below the plane, and whether both eyes see it there at
+    how much less than that lies clearly below the plane, and whether it could be matched there at
     all, each (N, M).
     """
     scaled = (-samples.disparity_m * planes).astype(np.float32)

@@ -5,7 +5,17 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from floor_scenes import SMALL_CAMERA, Patch, Scene, blank_floored, box, floor_patch, ramp, wall
+from floor_scenes import (
+    CAMERA,
+    SMALL_CAMERA,
+    Patch,
+    Scene,
+    blank_floored,
+    box,
+    floor_patch,
+    ramp,
+    wall,
+)
 
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import Mount, StereoFrame
@@ -60,6 +70,18 @@ def test_what_is_known_is_kept():
     assert (mount.height_m, mount.roll_rad) == (0.3, 0.0)
     assert (mount.forward_m, mount.left_m) == (0.2, -0.1)
     assert np.degrees(mount.pitch_rad) == pytest.approx(7.0, abs=0.2)
+
+
+def test_a_floor_nearer_than_is_searched_is_found() -> None:
+    """Of a low camera with eyes far apart the near floor's disparities are over a quarter of the
+    width, as far as a matcher looks while no mount is known: what it matches there is not there.
+    """
+    camera = replace(CAMERA, fx=300.0, fy=300.0, baseline_m=0.14)
+    true = Mount(0.16, np.radians(10.0))
+    mount = estimate(Scene([floor_patch(), wall()], camera=camera, mount=true))
+    assert mount is not None
+    assert mount.height_m == pytest.approx(0.16, rel=0.02)
+    assert np.degrees(mount.pitch_rad) == pytest.approx(10.0, abs=0.2)
 
 
 def test_a_table_is_not_the_floor():

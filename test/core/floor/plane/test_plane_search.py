@@ -250,22 +250,23 @@ def test_samples_lie_on_even_and_odd_rows_alike() -> None:
     assert np.mean(np.rint(rows_of(samples, VGA)) % 2) == pytest.approx(0.5, abs=0.05)
 
 
-def test_what_only_one_eye_sees_of_the_floor_is_no_hole_in_it() -> None:
-    """At the left of the image the near floor is beyond the edge of the right one: what is matched
-    there is something else.
+@pytest.mark.parametrize(('where', 'searched_px'), [('left', 320), ('near', 64)])
+def test_floor_that_cannot_be_matched_is_no_hole_in_it(where: str, searched_px: int) -> None:
+    """At the left of the image the near floor is beyond the edge of the right one, and the nearest
+    is nearer than a matcher looks: what is matched there is something else.
     """
     rng = np.random.default_rng(4)
-    uv_px = rng.uniform((0, 260), (640, 480), (3000, 2))
+    uv_px = rng.uniform((0 if where == 'left' else 250, 260), (640, 480), (3000, 2))
     camera = StereoCamera(640, 480, 400.0, 400.0, 319.5, 239.5, 0.12)
     rays = camera.back_project(uv_px, np.ones(3000))
     level = np.array([0.1, 0.0, 0.25])
     true_px = -camera.disparity_times_depth * rays @ plane_of(level)
-    hidden = true_px > uv_px[:, 0]
+    hidden = true_px > np.minimum(uv_px[:, 0], searched_px)
     seen_px = np.where(hidden, rng.uniform(1.0, 0.6 * true_px), true_px)
     assert hidden.mean() > 0.1
-    support, below = (
-        shares(Samples.of(camera, uv_px, seen_px, np.ones(3000), None, is_matched), level)
-        for is_matched in (True, False)
+    matched, measured = (
+        shares(Samples.of(camera, uv_px, seen_px, np.ones(3000), None, most_px), level)
+        for most_px in (searched_px, np.inf)
     )
-    assert support == (1.0, 0.0)
-    assert below[1] > 0.1
+    assert matched == (1.0, 0.0)
+    assert measured[1] > 0.1
