@@ -56,12 +56,13 @@ from segfloor_ros.core.floor.plane.plane import (
     PlaneFit,
     Samples,
     angles_height_of,
+    below_of,
     mean_climb,
+    most_on_one,
     plane_of,
     plausible,
     refine,
     scores,
-    shares,
 )
 from segfloor_ros.core.geometry import Array, invert
 
@@ -346,9 +347,8 @@ class PlaneSearch:
         near = [frame.near(fit.angles_height) for frame in frames]
         finer = self._finer(near, fit.angles_height, travel, (mean, sigma))
         fit = replace(fit, angles_height=finer.angles_height, sigma=finer.sigma)
-        if contrary:
-            below = max(fit.violations, shares(Samples.joined(contrary), fit.angles_height)[1])
-            fit = replace(fit, violations=below)
+        seen = [Samples.joined(group) for group in (some, _thinned(contrary)) if group]
+        fit = replace(fit, violations=max(self._seen_through(fit, part) for part in seen))
         self._guesses = np.concatenate([fit.angles_height[None], guesses[order]])
         self._guesses = self._guesses[plausible(self._guesses)]
         self._looks += 1
@@ -362,6 +362,15 @@ class PlaneSearch:
     ) -> PlaneFit:
         """Return a plane (3,) that is nearly known, refined by all samples of frames near it."""
         return refine(Samples.joined(near), start, self._known, travel, *prior, FINER_SCALES_PX)
+
+    def _seen_through(self, fit: PlaneFit, samples: Samples) -> float:
+        """Return the share of the samples that lie below a plane together, on another one: a surface
+        that is seen through it. Wrong matches lie anywhere.
+        """
+        below, total = below_of(samples, fit.angles_height)
+        if len(below.weight) < _LEAST_SAMPLES or below.weight.sum() == 0:
+            return 0.0
+        return most_on_one(below, planes_through(below, PROPOSALS, self._rng)) / total
 
     def _scatter(self, frames: list[Samples], fit: PlaneFit, prior: tuple[Array, Array]) -> Array:
         """Return the standard deviations (3,) of a plane by how much those of parts of the drive
@@ -511,11 +520,16 @@ def _below(blank: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def propose(samples: Samples, count: int, rng: np.random.Generator, known: Array) -> Array:
-    """Return plausible pitch, roll and height (M, 3) of planes through few samples each.
-
-    Half of them go through three samples, half through two, without roll. known: (3,), values
-    that are given, NaN where not.
+    """Return plausible pitch, roll and height (M, 3) of planes through few samples each. known:
+    (3,), values that are given, NaN where not.
     """
+    planes = planes_through(samples, count, rng)
+    guesses = np.where(np.isnan(known), angles_height_of(planes), known)
+    return guesses[plausible(guesses)]
+
+
+def planes_through(samples: Samples, count: int, rng: np.random.Generator) -> Array:
+    """Return planes m (M, 3), half of them through three samples, half through two, without roll."""
     probability = samples.weight / samples.weight.sum()
     chosen = rng.choice(len(samples.weight), size=(count, 3), p=probability)
     q = samples.rays[chosen]
@@ -526,9 +540,7 @@ def propose(samples: Samples, count: int, rng: np.random.Generator, known: Array
     inverse_depth[half:, 2] = 0.0
     regular = np.abs(np.linalg.det(rows)) > 1e-6
     planes = np.linalg.solve(rows[regular], -inverse_depth[regular][..., None])[..., 0]
-    planes = planes[np.isfinite(planes).all(axis=1) & (np.abs(planes).max(axis=1) > 1e-6)]
-    guesses = np.where(np.isnan(known), angles_height_of(planes), known)
-    return guesses[plausible(guesses)]
+    return planes[np.isfinite(planes).all(axis=1) & (np.abs(planes).max(axis=1) > 1e-6)]
 
 
 def preference(angles_height: Array, travel: Array, mean: Array, sigma: Array) -> Array:

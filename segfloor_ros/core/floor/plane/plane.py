@@ -137,9 +137,10 @@ SWAY = (math.radians(2.0), math.radians(2.5), 0.04)
 """How much pitch, roll and height, as a share of it, of the camera above the floor vary on the way,
 as standard deviations: robots sway, and where they are is known so well.
 """
-_LEAST_SUPPORT, _MOST_BELOW = 0.08, 0.15
-"""A floor is so much of what is seen where it is visible. What is seen below it, of mirrors and
-wrong matches, is so small a share of that: of true floors 0.11 at most, of boards 0.2 to 0.4.
+_LEAST_SUPPORT, _MOST_BELOW = 0.04, 0.25
+"""A floor is so much of what is seen where it is visible, 0.07 or more, of posters at one height
+0.02. What is seen through it is so small a share of that: of true floors 0.15 at most, of others,
+and of mirrors, 0.33 and more.
 """
 
 
@@ -260,14 +261,31 @@ def shares(samples: Samples, angles_height: Array) -> tuple[float, float]:
     """Return which share of the weight of the samples where a plane, (3,), is visible lies on it,
     and which below it.
     """
-    seen = _seen(samples, plane_of(angles_height)[None])
-    error, limit, visible = (column[:, 0] for column in seen)
+    plane = plane_of(angles_height)
+    error, limit, visible = (column[:, 0] for column in _seen(samples, plane[None]))
     weight = np.where(visible, samples.weight, 0)
     total = float(weight.sum())
     if total == 0:
         return 0.0, 1.0
-    on, below = weight[np.abs(error) < SAME_PX].sum(), weight[error < limit].sum()
+    is_on = visible & (np.abs(error) < SAME_PX)
+    on, below = samples.weight_on(plane)[is_on].sum(), weight[error < limit].sum()
     return float(on) / total, float(below) / total
+
+
+def below_of(samples: Samples, angles_height: Array) -> tuple[Samples, float]:
+    """Return the samples that lie clearly below a plane, (3,), and the weight of all where it is
+    visible.
+    """
+    seen = _seen(samples, plane_of(angles_height)[None])
+    error, limit, visible = (column[:, 0] for column in seen)
+    is_below = visible & (error < limit)
+    return samples.take(np.flatnonzero(is_below)), float(samples.weight[visible].sum())
+
+
+def most_on_one(samples: Samples, planes: Array) -> float:
+    """Return the weight of the samples that lie on the same of planes m (M, 3), at most."""
+    error, _, _ = _seen(samples, planes)
+    return float((samples.weight @ (np.abs(error) < SAME_PX)).max(initial=0.0))
 
 
 def mean_climb(angles_height: Array, travel: Array) -> Array:

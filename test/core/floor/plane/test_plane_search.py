@@ -203,6 +203,28 @@ def test_a_plane_below_which_much_is_seen_is_no_floor(
     assert search.is_known() is is_known
 
 
+@pytest.mark.parametrize(('spread', 'is_known'), [(1.0, True), (0.05, False)])
+def test_wrong_matches_are_no_surface_that_is_seen_through_the_floor(
+    spread: float, is_known: bool
+) -> None:
+    """A quarter of the samples lie below the plane: anywhere, as wrong matches do, or on a wall."""
+    rng = np.random.default_rng(2)
+    u, v = rng.uniform(-0.8, 0.8, 3000), rng.uniform(0.1, 0.8, 3000)
+    rays = np.stack([u, v, np.ones(3000)], axis=1)
+    disparity = -DISPARITY_M * rays @ plane_of(TRUE) + rng.normal(0, 0.2, 3000)
+    disparity[:750] *= rng.uniform(0, 0.9, 750)
+    wall_px = 0.3 * disparity.min()
+    disparity[:750] = spread * disparity[:750] + (1 - spread) * wall_px
+    search = PlaneSearch(UNKNOWN)
+    for _ in range(4):
+        frame = Samples(rays, disparity, *weighing_alike(3000), DISPARITY_M, 0.0)
+        fit = search.add(frame, level_prior(None, np.eye(4)), STILL, [])
+    assert fit is not None
+    assert fit.angles_height == pytest.approx(TRUE, abs=0.01)
+    assert shares(frame, TRUE)[1] > 0.2
+    assert search.is_known() is is_known
+
+
 def rows_of(samples: Samples, camera: StereoCamera = CAMERA) -> np.ndarray:
     """Return the rows (N,) at which a level camera at the origin took samples."""
     return samples.rays[:, 1] * camera.fy + camera.cy
