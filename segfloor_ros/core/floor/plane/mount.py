@@ -56,15 +56,17 @@ from segfloor_ros.core.floor.plane.plane import (
     PlaneFit,
     Samples,
     angles_height_of,
-    below_of,
     mean_climb,
-    most_on_one,
     plane_of,
     plausible,
     refine,
     scores,
+    shares,
 )
 from segfloor_ros.core.geometry import Array, invert
+
+Image = NDArray[np.uint8]
+Disparities = NDArray[np.float32]
 
 _USUAL = np.array([0.0, 0.0, 0.3])
 """Pitch, roll and height while nothing is known."""
@@ -188,7 +190,7 @@ class MountEstimator:
 
     def add(
         self,
-        left: NDArray[np.uint8],
+        left: Image,
         right: NDArray[Any],
         T_world_left: Array,
         up_world: Up | None = None,
@@ -203,19 +205,12 @@ class MountEstimator:
         if self.is_final:
             return
         self._looks_again += self.mount is not None
-        if not is_new_view:
-            del self._poses[-1:]
-        self._poses.append(T_world_left)
-        is_measured = is_disparity(right)
+        self._poses = [*(self._poses if is_new_view else self._poses[:-1]), T_world_left]
         self._viewer = viewer = self._viewer.for_mount(self.mount)
-        noise = noise_grey(left)
-        if not is_measured:
-            right = equal_exposure(left, right)
+        noise, is_measured = noise_grey(left), is_disparity(right)
+        right = np.nan_to_num(right, nan=0.0) if is_measured else equal_exposure(left, right)
         left, right = left[viewer.first_row :], right[viewer.first_row :]
-        if is_measured:
-            disparity: NDArray[np.float32] = np.nan_to_num(right, nan=0.0)
-        else:
-            disparity = viewer.disparity(left, right)
+        disparity: NDArray[Any] = right if is_measured else viewer.disparity(left, right)
         seen = None if is_measured else max(noise, _LEAST_NOISE_GREY)
         surfaces = viewer.surfaces(left, right, disparity, seen)
         prior, travel = level_prior(up_world, T_world_left), self._travel()
@@ -290,9 +285,8 @@ def level_prior(up: Up | None, T_world_left: Array) -> tuple[Array, Array]:
     if up is None:
         return np.zeros(3), LEVEL_SIGMA
     sigma = math.hypot(up.sigma_rad, _FLOOR_SLOPE)
-    return angles_height_of(T_world_left[:3, :3].T @ up.direction), np.array(
-        [sigma, sigma, math.inf]
-    )
+    level = angles_height_of(T_world_left[:3, :3].T @ up.direction)
+    return level, np.array([sigma, sigma, math.inf])
 
 
 class PlaneSearch:
@@ -346,31 +340,22 @@ class PlaneSearch:
         fit = refine(Samples.joined(some), guesses[order[0]], self._known, travel, mean, sigma)
         near = [frame.near(fit.angles_height) for frame in frames]
         finer = self._finer(near, fit.angles_height, travel, (mean, sigma))
-        fit = replace(fit, angles_height=finer.angles_height, sigma=finer.sigma)
-        seen = [Samples.joined(group) for group in (some, _thinned(contrary)) if group]
-        fit = replace(fit, violations=max(self._seen_through(fit, part) for part in seen))
+        groups = [Samples.joined(few) for few in (some, _thinned(contrary)) if few]
+        seen = [shares(few, finer.angles_height) for few in groups]
+        fit = replace(finer, support=seen[0][0], violations=max(below for _, below in seen))
         self._guesses = np.concatenate([fit.angles_height[None], guesses[order]])
         self._guesses = self._guesses[plausible(self._guesses)]
         self._looks += 1
-        if self._is_known(fit):
-            fit = replace(fit, sigma=np.hypot(fit.sigma, self._scatter(near, fit, prior)))
         self.fit = fit
-        return fit
+        if self.is_known():
+            self.fit = replace(fit, sigma=np.hypot(fit.sigma, self._scatter(near, fit, prior)))
+        return self.fit
 
     def _finer(
         self, near: list[Samples], start: Array, travel: Array, prior: tuple[Array, Array]
     ) -> PlaneFit:
         """Return a plane (3,) that is nearly known, refined by all samples of frames near it."""
         return refine(Samples.joined(near), start, self._known, travel, *prior, FINER_SCALES_PX)
-
-    def _seen_through(self, fit: PlaneFit, samples: Samples) -> float:
-        """Return the share of the samples that lie below a plane together, on another one: a surface
-        that is seen through it. Wrong matches lie anywhere.
-        """
-        below, total = below_of(samples, fit.angles_height)
-        if len(below.weight) < _LEAST_SAMPLES or below.weight.sum() == 0:
-            return 0.0
-        return most_on_one(below, planes_through(below, PROPOSALS, self._rng)) / total
 
     def _scatter(self, frames: list[Samples], fit: PlaneFit, prior: tuple[Array, Array]) -> Array:
         """Return the standard deviations (3,) of a plane by how much those of parts of the drive
@@ -392,13 +377,12 @@ class PlaneSearch:
         Before that can vary it must be known four times better. In the end any view will do, and a
         plane that is off by some per cent is better than none.
         """
-        return self.fit is not None and self._is_known(self.fit)
-
-    def _is_known(self, fit: PlaneFit) -> bool:
+        if self.fit is None:
+            return False
         is_late = self._looks >= MAX_KEYFRAMES
         sure = 1.0 if is_late or len(self.frames) >= LOOKS else SIGMAS * SIGMAS
-        sigma = sure * fit.sigma / (1.0, 1.0, fit.angles_height[2])
-        return fit.is_seen and bool((sigma < _SIGMA * (2 if is_late else 1)).all())
+        sigma = sure * self.fit.sigma / (1.0, 1.0, self.fit.angles_height[2])
+        return self.fit.is_seen and bool((sigma < _SIGMA * (2 if is_late else 1)).all())
 
 
 def _thinned(frames: list[Samples]) -> list[Samples]:
@@ -442,16 +426,12 @@ class MountViewer:
         """Return one that looks at the floor below a mount."""
         return self if mount == self._mount else MountViewer(self._camera, mount)
 
-    def disparity(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def disparity(self, left: Image, right: Image) -> Disparities:
         """Return the disparities (R, W) of these rows of a pair, 0 where there is no match."""
         return self._matcher.compute(left, right, self._fine_rows)
 
     def surfaces(
-        self,
-        left: NDArray[np.uint8],
-        right: NDArray[np.uint8],
-        disparity: NDArray[np.float32],
-        noise: float | None,
+        self, left: Image, right: Image, disparity: Disparities, noise: float | None
     ) -> Samples:
         """Return samples of all that has texture. noise: of the images, in grey levels; None where
         depth is measured, which needs no texture.
@@ -468,11 +448,9 @@ class MountViewer:
             return self._placed(rows, columns, disparity[rows, columns], np.ones(len(rows)), rise)
         row, column, found_px, sigma = refined(left, right, disparity, noise, (rows, columns))
         weight = 1.0 / (1.0 + (sigma / NOISE_PX) ** 2)
-        return self._placed(row, column, found_px, weight, rise, self._matcher.num_disparities)
+        return self._placed(row, column, found_px, weight, rise)
 
-    def bases(
-        self, left: NDArray[np.uint8], disparity: NDArray[np.float32], enough: float
-    ) -> Samples:
+    def bases(self, left: Image, disparity: Disparities, enough: float) -> Samples:
         """Return samples of where upright things stand on blank floor."""
         rows, columns, found_px = find_bases(left, disparity, enough)
         return self._placed(rows, columns, found_px, np.full(len(rows), _BASE_WEIGHT))
@@ -484,14 +462,13 @@ class MountViewer:
         found_px: NDArray[np.floating],
         weight: Array,
         rise: Array | None = None,
-        searched_px: float = math.inf,
     ) -> Samples:
         uv_px = np.stack([columns, rows + self.first_row], axis=1).astype(np.float64)
-        return Samples.of(self._camera, uv_px, found_px.astype(float), weight, rise, searched_px)
+        return Samples.of(self._camera, uv_px, found_px.astype(float), weight, rise)
 
 
 def find_bases(
-    left: NDArray[np.uint8], disparity_px: NDArray[np.float32], enough: float
+    left: Image, disparity_px: Disparities, enough: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.floating]]:
     """Return rows, columns (N,) and disparities (N,) of where upright things stand on blank floor
     in an image (H, W) of known disparities (H, W), 0 for none. enough: texture that is no noise.
@@ -520,16 +497,11 @@ def _below(blank: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def propose(samples: Samples, count: int, rng: np.random.Generator, known: Array) -> Array:
-    """Return plausible pitch, roll and height (M, 3) of planes through few samples each. known:
-    (3,), values that are given, NaN where not.
+    """Return plausible pitch, roll and height (M, 3) of planes through few samples each.
+
+    Half of them go through three samples, half through two, without roll. known: (3,), values
+    that are given, NaN where not.
     """
-    planes = planes_through(samples, count, rng)
-    guesses = np.where(np.isnan(known), angles_height_of(planes), known)
-    return guesses[plausible(guesses)]
-
-
-def planes_through(samples: Samples, count: int, rng: np.random.Generator) -> Array:
-    """Return planes m (M, 3), half of them through three samples, half through two, without roll."""
     probability = samples.weight / samples.weight.sum()
     chosen = rng.choice(len(samples.weight), size=(count, 3), p=probability)
     q = samples.rays[chosen]
@@ -540,7 +512,9 @@ def planes_through(samples: Samples, count: int, rng: np.random.Generator) -> Ar
     inverse_depth[half:, 2] = 0.0
     regular = np.abs(np.linalg.det(rows)) > 1e-6
     planes = np.linalg.solve(rows[regular], -inverse_depth[regular][..., None])[..., 0]
-    return planes[np.isfinite(planes).all(axis=1) & (np.abs(planes).max(axis=1) > 1e-6)]
+    planes = planes[np.isfinite(planes).all(axis=1) & (np.abs(planes).max(axis=1) > 1e-6)]
+    guesses = np.where(np.isnan(known), angles_height_of(planes), known)
+    return guesses[plausible(guesses)]
 
 
 def preference(angles_height: Array, travel: Array, mean: Array, sigma: Array) -> Array:
@@ -548,5 +522,4 @@ def preference(angles_height: Array, travel: Array, mean: Array, sigma: Array) -
     with their standard deviations, and a camera that travels (T, 3), in metres, parallel to it.
     """
     squares = (((angles_height - mean) / sigma) ** 2).sum(axis=1)
-    squares += mean_climb(angles_height, travel) ** 2
-    return np.exp(-0.5 * squares)
+    return np.exp(-0.5 * (squares + mean_climb(angles_height, travel) ** 2))

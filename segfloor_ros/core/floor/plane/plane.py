@@ -40,7 +40,6 @@ SAMPLES = 4000
 """So many pixels of an image are looked at: their neighbours say the same."""
 _BEND = 0.05
 """A floor bends, and its disparity differs from the plane's, by this share."""
-_VIOLATION_WEIGHT = 1.5
 _CORRELATED_SAMPLES = 12.0
 """Neighbouring samples err together: so many count as one."""
 _NATS = 0.5 * SIGMAS**2 / _CORRELATED_SAMPLES
@@ -65,16 +64,14 @@ _AT_ONCE = 200
 @dataclass(frozen=True)
 class Samples:
     """Disparities of one frame: rays (N, 3), disparities (N,) in pixels, weights (N,). rise: (N,),
-    by how much disparities grow per row around the samples, NaN where that is not known. most_px:
-    (N,), the disparity from which on a sample is beyond the edge of the right image, or not looked
-    for. disparity_m: fx * baseline. down: by how much rays change per row.
+    by how much disparities grow per row around the samples, NaN where that is not known.
+    disparity_m: fx * baseline. down: by how much rays change per row.
     """
 
     rays: Array
     disparity_px: Array
     weight: Array
     rise: Array
-    most_px: Array
     disparity_m: float
     down: float
 
@@ -86,17 +83,11 @@ class Samples:
         disparity_px: Array,
         weight: Array,
         rise: Array | None = None,
-        searched_px: float = math.inf,
     ) -> Samples:
-        """Return the samples at pixels (N, 2). searched_px: the largest disparity that a matcher
-        tried: what is nearer, or seen by one eye alone, it matches with something else.
-        """
+        """Return the samples at pixels (N, 2)."""
         rays = camera.back_project(uv_px, np.ones(len(uv_px)))
         rise = np.full(len(uv_px), np.nan) if rise is None else rise
-        is_all = math.isinf(searched_px)
-        most = np.full(len(uv_px), np.inf) if is_all else np.minimum(uv_px[:, 0], searched_px)
-        scale = camera.disparity_times_depth, 1.0 / camera.fy
-        return cls(rays, disparity_px, weight, rise, most, *scale)
+        return cls(rays, disparity_px, weight, rise, camera.disparity_times_depth, 1.0 / camera.fy)
 
     def every(self, step: int) -> Samples:
         """Return only one of every so many, which weighs as much as these."""
@@ -129,7 +120,7 @@ class Samples:
         return self.weight * np.where(rises, 1.0, _FLAT_WEIGHT)
 
 
-_OF_EACH = ('rays', 'disparity_px', 'weight', 'rise', 'most_px')
+_OF_EACH = ('rays', 'disparity_px', 'weight', 'rise')
 """What `Samples` have of each pixel."""
 LOOKS = 4
 """By so many frames it is seen how much a plane varies."""
@@ -138,9 +129,8 @@ SWAY = (math.radians(2.0), math.radians(2.5), 0.04)
 as standard deviations: robots sway, and where they are is known so well.
 """
 _LEAST_SUPPORT, _MOST_BELOW = 0.04, 0.25
-"""A floor is so much of what is seen where it is visible, 0.07 or more, of posters at one height
-0.02. What is seen through it is so small a share of that: of true floors 0.15 at most, of others,
-and of mirrors, 0.33 and more.
+"""Least support of a floor (true ones 0.07 or more, posters at one height 0.02), and most
+violations as a share of it (true ones 0.15 at most, others and mirrors 0.33 or more).
 """
 
 
@@ -158,8 +148,8 @@ class PlaneFit:
 
     angles_height: Array
     sigma: Array
-    support: float
-    violations: float
+    support: float = 0.0
+    violations: float = 0.0
     evidence: float = math.nan
 
     @property
@@ -229,16 +219,14 @@ def plausible(angles_height: Array) -> NDArray[np.bool_]:
 
 def _seen(samples: Samples, planes: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return of each sample and each plane m (M, 3) by how much its disparity exceeds the plane's,
-    how much less than that lies clearly below the plane, and whether it could be matched there at
-    all, each (N, M).
+    how much less than that lies clearly below the plane, and whether it is seen there at all, each
+    (N, M).
     """
     scaled = (-samples.disparity_m * planes).astype(np.float32)
     expected = samples.rays.astype(np.float32) @ scaled.T
-    visible = (expected > SAME_PX) & (expected < samples.most_px[:, None])
+    visible = expected > SAME_PX
     error = samples.disparity_px[:, None].astype(np.float32) - expected
-    expected *= np.float32(-_BEND)
-    expected -= np.float32(2 * SAME_PX)
-    return error, expected, visible
+    return error, np.float32(-_BEND) * expected - np.float32(2 * SAME_PX), visible
 
 
 def scores(samples: Samples, angles_height: Array) -> Array:
@@ -251,41 +239,31 @@ def scores(samples: Samples, angles_height: Array) -> Array:
     for start in range(0, len(samples.weight), _AT_ONCE):
         part = samples.take(slice(start, start + _AT_ONCE))
         error, limit, visible = _seen(part, planes)
-        below = np.float32(_VIOLATION_WEIGHT) * (error < limit)
         on = 1 - np.minimum((error / np.float32(SAME_PX)) ** 2, 1)
-        total += part.weight @ ((on - below) * visible)
+        total += part.weight @ ((on - (error < limit)) * visible)
     return total
 
 
 def shares(samples: Samples, angles_height: Array) -> tuple[float, float]:
     """Return which share of the weight of the samples where a plane, (3,), is visible lies on it,
-    and which below it.
+    and which below it, together on another one without roll: a surface that is seen through it.
+    Wrong matches lie anywhere.
     """
     plane = plane_of(angles_height)
     error, limit, visible = (column[:, 0] for column in _seen(samples, plane[None]))
-    weight = np.where(visible, samples.weight, 0)
-    total = float(weight.sum())
+    total = float(samples.weight @ visible)
     if total == 0:
         return 0.0, 1.0
-    is_on = visible & (np.abs(error) < SAME_PX)
-    on, below = samples.weight_on(plane)[is_on].sum(), weight[error < limit].sum()
-    return float(on) / total, float(below) / total
-
-
-def below_of(samples: Samples, angles_height: Array) -> tuple[Samples, float]:
-    """Return the samples that lie clearly below a plane, (3,), and the weight of all where it is
-    visible.
-    """
-    seen = _seen(samples, plane_of(angles_height)[None])
-    error, limit, visible = (column[:, 0] for column in seen)
-    is_below = visible & (error < limit)
-    return samples.take(np.flatnonzero(is_below)), float(samples.weight[visible].sum())
-
-
-def most_on_one(samples: Samples, planes: Array) -> float:
-    """Return the weight of the samples that lie on the same of planes m (M, 3), at most."""
-    error, _, _ = _seen(samples, planes)
-    return float((samples.weight @ (np.abs(error) < SAME_PX)).max(initial=0.0))
+    on = (visible * samples.weight_on(plane))[np.abs(error) < SAME_PX].sum()
+    below = samples.take(np.flatnonzero(samples.weight * visible * (error < limit)))
+    if len(below.weight) == 0:
+        return float(on) / total, 0.0
+    down, found_px = below.rays[:, 1:2], below.disparity_px[:, None]
+    one, other = np.random.default_rng(0).choice(len(down), size=(2, PROPOSALS))
+    slope = (found_px[one] - found_px[other]) / (down[one] - down[other] + 1e-9)
+    off_px = found_px - (found_px[one] + slope * (down.T - down[one])).T
+    together = (below.weight @ (np.abs(off_px) < SAME_PX)).max()
+    return float(on) / total, float(together) / total
 
 
 def mean_climb(angles_height: Array, travel: Array) -> Array:
@@ -335,7 +313,7 @@ def refine(
     covariance = np.linalg.pinv(information[np.ix_(free, free)])
     by_offset = OFFSET_SIGMA_PX * (covariance @ shared[free])
     error[free] = np.sqrt(np.maximum(np.diag(covariance), 0) + by_offset**2)
-    return PlaneFit(state, error, *shares(samples, state))
+    return PlaneFit(state, error)
 
 
 def _jacobian(angles_height: Array) -> Array:
@@ -484,6 +462,7 @@ def _refined(samples: Samples, guess: Array, prior: FramePrior) -> PlaneFit:
     expected = prior.means[nearest], prior.sigmas[nearest]
     unknown, still = np.full(3, np.nan), np.zeros((0, 3))
     fit = refine(samples, guess, unknown, still, *expected, NEAR_SCALES_PX)
-    evidence = prior.log_posterior(samples, fit.angles_height[None])[0]
+    state = fit.angles_height
+    evidence = prior.log_posterior(samples, state[None])[0]
     evidence += np.log(fit.sigma).sum() + 1.5 * math.log(2 * math.pi)
-    return replace(fit, evidence=float(evidence))
+    return PlaneFit(state, fit.sigma, *shares(samples, state), float(evidence))
