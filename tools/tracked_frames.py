@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +15,15 @@ from segfloor_ros.apps.trajectory import TrackedPose, corrected_trajectory
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.camera.recording import RecordedSensor
 from segfloor_ros.core.configuration import Configuration
-from segfloor_ros.core.contracts import FrameResult, KeyframePath, Mount, StereoFrame
+from segfloor_ros.core.contracts import FrameResult, Keyframe, KeyframePath, Mount, StereoFrame
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.plugins.assembly import make_slam
 from segfloor_ros.core.slam.drift import DriftMeter
 from segfloor_ros.core.slam.held_results import left_out
 from segfloor_ros.core.slam.stereo_slam import CAMERA_AS_BASE
 from tools.driving import after_sensors, drive
+
+NO_IMAGES: dict[str, Any] = dict.fromkeys(('left', 'right'), np.zeros((0, 0), np.uint8))
 
 UNCERTAIN = 'uncertain'
 """In the state of a frame whose place is weak."""
@@ -75,7 +78,7 @@ def track_frames(
     mount = None if with_mount or settings.has_mount else CAMERA_AS_BASE
     slam = make_slam(camera, settings, mount)
     results: list[FrameResult] = []
-    keyframe_ns: set[int] = set()
+    keyframes: dict[int, Keyframe] = {}
     path = KeyframePath(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
     start_s = time.thread_time()
 
@@ -84,7 +87,7 @@ def track_frames(
         for result in published:
             if result.keyframe is not None:
                 path = result.keyframe.path
-                keyframe_ns.add(result.stamp_ns)
+                keyframes[result.stamp_ns] = dataclasses.replace(result.keyframe, **NO_IMAGES)
             while results and results[-1].index >= result.index:  # they come once more
                 results.pop()
             results.append(dataclasses.replace(result, keyframe=None, moving=None))
@@ -98,10 +101,10 @@ def track_frames(
     assert slam.mount is not None
     began_ns = path.stamp_ns[0] if len(path.stamp_ns) else 0
     results = [left_out(r) if r.tracked and r.stamp_ns < began_ns else r for r in results]
-    meter, drift = DriftMeter(camera.fx), []
+    meter, drift = DriftMeter(camera), []
     meter.T_base_left = slam.mount.T_base_left
     for result in results:
-        meter.see(result, result.stamp_ns in keyframe_ns)
+        meter.see(result, keyframes.get(result.stamp_ns))
         drift.append(meter.drift)
     return TrackedFrames(
         results,

@@ -20,7 +20,7 @@ from segfloor_ros.core.contracts import FrameResult, Keyframe, Mount, StereoFram
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.slam.drift import DriftMeter
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
-from segfloor_ros.nodes.messages import odometry as odometry_messages
+from segfloor_ros.nodes.messages import odometry as odoms
 from segfloor_ros.nodes.messages import points, poses
 from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART, Level
@@ -85,7 +85,7 @@ class SlamTopics:
     def begin(self, calibration: StereoCalibration, frames: CameraFrames) -> None:
         """Publish about this camera from now on. calibration: of the rectified images."""
         self._calibration, self.frames = calibration, frames
-        self._drift = DriftMeter(calibration.camera.fx)
+        self._drift = DriftMeter(calibration.camera)
 
     def publish_mount(self, mount: Mount) -> None:
         """Publish where the left camera sits on the base; the stamp tells for which map."""
@@ -96,13 +96,12 @@ class SlamTopics:
 
     def publish(self, result: FrameResult) -> None:
         """Publish a frame's pose, none while there is none, and everything of a keyframe."""
-        self._drift.see(result, result.keyframe is not None)
+        self._drift.see(result, result.keyframe)
         if result.tracked and result.stamp_ns != self._announced_ns:
             self._publish_pose(result)
         if result.moving is not None:
-            frame_id = self._own.map_frame
-            message = points.moving_points_message(result.stamp_ns, frame_id, result.moving)
-            self._out.publish('moving_points', message)
+            at = result.stamp_ns, self._own.map_frame
+            self._out.publish('moving_points', points.moving_points_message(*at, result.moving))
         if result.keyframe is not None:
             self._publish_keyframe(result, result.keyframe)
         self._last = result
@@ -111,6 +110,7 @@ class SlamTopics:
         """Publish pose and images of a keyframe that the map has still to take in. moving: a mask
         (H, W).
         """
+        self._drift.see(result, None)
         self._publish_pose(result)
         T_map_base = result.T_map_odom @ result.T_odom_base
         self._publish_view(result, frame.left, frame.right, moving, T_map_base)
@@ -153,27 +153,22 @@ class SlamTopics:
 
     def _publish_odometry(self, result: FrameResult, suffix: str) -> None:
         last, twist, of_twist = self._last, None, None
-        covariance = odometry_messages.never_certain(result.covariance)
         if last is not None and last.tracked and result.stamp_ns > last.stamp_ns:
             duration_s = (result.stamp_ns - last.stamp_ns) * 1e-9
-            twist = odometry_messages.body_twist(last.T_odom_base, result.T_odom_base, duration_s)
-            before = odometry_messages.never_certain(last.covariance)
-            of_twist = odometry_messages.twist_covariance(
-                before, result.T_odom_base, covariance, duration_s
-            )
+            twist = odoms.body_twist(last.T_odom_base, result.T_odom_base, duration_s)
+            before, now = (odoms.never_certain(one.covariance) for one in (last, result))
+            of_twist = odoms.twist_covariance(before, result.T_odom_base, now, duration_s)
         own = self._own
         if self._out.listeners('pose' + suffix):
             T_map_base = result.T_map_odom @ result.T_odom_base
             at = result.stamp_ns, own.map_frame
-            in_map = odometry_messages.never_certain(result.covariance_in_map)
-            message = odometry_messages.pose_with_covariance_message(*at, T_map_base, in_map)
+            in_map = odoms.never_certain(result.covariance_in_map)
+            message = odoms.pose_with_covariance_message(*at, T_map_base, in_map)
             self._out.publish('pose' + suffix, message)
         at, T_odom_base = (result.stamp_ns, own.odom_frame), result.T_odom_base
-        in_odom = odometry_messages.never_certain(self._drift.covariance(result))
-        odometry = odometry_messages.odometry_message(
-            *at, own.base_frame, T_odom_base, in_odom, twist, of_twist
-        )
-        self._out.publish('odometry' + suffix, odometry)
+        in_odom = odoms.never_certain(self._drift.covariance(result))
+        more: Any = (T_odom_base, in_odom, twist, of_twist)
+        self._out.publish('odometry' + suffix, odoms.odometry_message(*at, own.base_frame, *more))
 
     def _publish_keyframe(self, result: FrameResult, keyframe: Keyframe) -> None:
         if keyframe.stamp_ns != self._announced_ns:
@@ -181,8 +176,7 @@ class SlamTopics:
             self._publish_view(result, keyframe.left, keyframe.right, moving, T_map_base)
         out, at = self._out, (keyframe.stamp_ns, self._own.map_frame)
         out.publish('keyframe/features', points.features_message(*at, keyframe.features))
-        path = self._path_messages.next(keyframe.stamp_ns, keyframe.path)
-        out.publish('keyframe/path', path)
+        out.publish('keyframe/path', self._path_messages.next(keyframe.stamp_ns, keyframe.path))
         out.publish('map_points', points.sparse_cloud_message(*at, keyframe.cloud))
 
     def _publish_view(
@@ -201,8 +195,8 @@ class SlamTopics:
         self._publish_pair(KEYFRAME_PARTS, stamp_ns, (left, right), self._calibration)
         moving = np.zeros_like(left) if moving is None else moving
         out.publish(MOVING_MASK, image_message(stamp_ns, self.frames.left, moving))
-        covariance = odometry_messages.never_certain(result.covariance_in_map)
-        pose = odometry_messages.odometry_message(*at, own.base_frame, T_map_base, covariance)
+        covariance = odoms.never_certain(result.covariance_in_map)
+        pose = odoms.odometry_message(*at, own.base_frame, T_map_base, covariance)
         out.publish('keyframe/odometry', pose)
         out.publish(MAP_START, map_start_message(*at, self.map_start_ns))
 
@@ -325,7 +319,7 @@ class SlamResults:
         # Frames before it was certain come later.
         since_ns = min(self._in_map_since_ns or result.stamp_ns, result.stamp_ns)
         self._in_map_since_ns = since_ns
-        sigmas = np.sqrt(np.diag(odometry_messages.never_certain(result.covariance_in_map)))
+        sigmas = np.sqrt(np.diag(odoms.never_certain(result.covariance_in_map)))
         return {
             'in_map_s': f'{1e-9 * (result.stamp_ns - since_ns):.2f}',
             'place_sigma_m': f'{sigmas[:3].max():.4f}',

@@ -12,14 +12,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from segfloor_ros.core.contracts import FrameResult
+from segfloor_ros.core.camera.model import OFFSET_SIGMA_PX, StereoCamera
+from segfloor_ros.core.contracts import FrameResult, Keyframe
 from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.twists import adjoint, se3_exp, se3_log, skew
 
 AXIS_SIGMA_PX, SCALE_SIGMA = 0.7, 0.0017
-"""Of a calibration by some pictures of a board: the principal point, and focal length and baseline
-as shares; of the size that Zhang reports (A flexible new technique for camera calibration, IEEE
-T-PAMI 2000)."""
+"""Of a calibration by pictures of a board: principal point; focal length and baseline as shares.
+Zhang, A flexible new technique for camera calibration, IEEE T-PAMI 2000."""
 
 
 class DriftMeter:
@@ -27,22 +27,33 @@ class DriftMeter:
 
     The points of a keyframe lie where the camera had it, and were measured no better than it is by
     those of the one before: each keyframe adds the covariance of its own pose for both. A stretch
-    without images adds that of its end. T_base_left: (4, 4), the mount, as soon as it is known.
+    without images adds that of its end. An error of all disparities makes what is far, and ways by
+    it, too long or too short. T_base_left: (4, 4), the mount, as soon as it is known.
     """
 
-    def __init__(self, focal_px: float) -> None:
+    def __init__(self, camera: StereoCamera) -> None:
         self.T_base_left: Array = np.eye(4)
         self.drift: Array = np.zeros((6, 10))
-        self._axis_rad = AXIS_SIGMA_PX / focal_px
+        self._camera, self._off = camera, 0.0
         self._last: FrameResult | None = None
+        self._is_keyframe = False
 
-    def see(self, result: FrameResult, is_keyframe: bool) -> None:
-        """Take in the next result; those that come once more change nothing."""
+    def see(self, result: FrameResult, keyframe: Keyframe | None) -> None:
+        """Take in the next result, and the keyframe that it is of, which may come after it; those
+        that come once more change nothing.
+        """
         last = self._last
-        if not result.tracked or (last is not None and result.stamp_ns <= last.stamp_ns):
+        is_more = keyframe is not None and not self._is_keyframe
+        if not result.tracked or (last and result.stamp_ns < last.stamp_ns + (not is_more)):
             return
-        self._last, drift = result, self.drift.copy()
-        errs = 2 * [result] if is_keyframe else []
+        self._last, self._is_keyframe, drift = result, keyframe is not None, self.drift.copy()
+        errs = [] if keyframe is None else 2 * [result]
+        if keyframe is not None:
+            T_map_left = keyframe.T_map_base @ self.T_base_left
+            z_m = (keyframe.features.xyz_map - T_map_left[:3, 3]) @ T_map_left[:3, 2]
+            seen_px = self._camera.disparity_times_depth / z_m[np.isfinite(z_m)]
+            # A way is known by points as the squares of their disparities are.
+            self._off = OFFSET_SIGMA_PX * seen_px.sum() / max(seen_px @ seen_px, 1e-9)
         if last is not None:
             before, now = (one.T_odom_base @ self.T_base_left for one in (last, result))
             moved = se3_log(invert(before) @ now)
@@ -64,10 +75,10 @@ class DriftMeter:
         """Return the twists (6, 4) by which the calibration makes a motion (6,) err."""
         way, turn = motion[:3], motion[3:]
         errors: Array = np.zeros((6, 4))
-        errors[:3, :2] = -self._axis_rad * skew(way)[:, :2]
-        errors[3:, :2] = -self._axis_rad * skew(turn)[:, :2]
-        # Of a way, the baseline and the focal length err.
-        errors[:3, 2], errors[3:, 3] = np.sqrt(2) * SCALE_SIGMA * way, SCALE_SIGMA * turn
+        errors[:, :2] = np.vstack([skew(way), skew(turn)])[:, :2] * -AXIS_SIGMA_PX / self._camera.fx
+        # Of a way, the baseline and the focal length err, and disparities.
+        errors[:3, 2] = np.hypot(np.sqrt(2) * SCALE_SIGMA, self._off) * way
+        errors[3:, 3] = SCALE_SIGMA * turn
         return errors
 
 

@@ -2,12 +2,21 @@
 
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 from sampled_poses import assert_spread, drawn_errors, uneven_covariance
 
-from segfloor_ros.core.contracts import FrameResult, Mount
-from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.camera.model import OFFSET_SIGMA_PX, StereoCamera
+from segfloor_ros.core.contracts import (
+    FrameResult,
+    Keyframe,
+    KeyframeFeatures,
+    KeyframePath,
+    Mount,
+    SparseCloud,
+)
+from segfloor_ros.core.geometry import invert, transform_points
 from segfloor_ros.core.slam.drift import (
     AXIS_SIGMA_PX,
     SCALE_SIGMA,
@@ -20,7 +29,8 @@ from segfloor_ros.core.twists import rotations_by, se3_exp, se3_logs
 STEP = se3_exp(np.array([0.3, 0.05, -0.02, -0.03, 0.02, 0.12]))
 """A base that drives and turns by 0.12 rad; of T_before_now."""
 
-STEPS, FOCAL_PX, STEP_NS = 12, 320.0, 100_000_000
+STEPS, STEP_NS = 12, 100_000_000
+CAMERA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.12)
 NOTHING = np.zeros((6, 6))
 T_BASE_LEFT = Mount(0.45, 0.35, -0.2, yaw_rad=0.4, forward_m=0.3, left_m=-0.15).T_base_left
 
@@ -41,12 +51,26 @@ def result_at(k, T_odom_base, covariance=NOTHING, **more):
     )
 
 
+def keyframe_at(T_map_base, xyz_map):
+    """Return a keyframe that sees points (N, 3)."""
+    ids, image = np.arange(len(xyz_map), dtype=np.int32), np.zeros((0, 0), np.uint8)
+    features = KeyframeFeatures(np.zeros((len(ids), 2), np.float32), ids, xyz_map)
+    path = KeyframePath(np.zeros(1, np.int64), T_map_base[None])
+    cloud = SparseCloud(ids, xyz_map)
+    return Keyframe(0, 0, T_map_base, image, image, features, path, cloud)
+
+
+def blind_keyframe(T_map_base):
+    """Return a keyframe that sees nothing."""
+    return keyframe_at(T_map_base, np.zeros((0, 3)))
+
+
 def driven(poses, covariance=NOTHING, keyframes=False):
     """Return the drift after poses (N, 4, 4)."""
-    meter = DriftMeter(FOCAL_PX)
+    meter = DriftMeter(CAMERA)
     meter.T_base_left = T_BASE_LEFT
     for k, T in enumerate(poses):
-        meter.see(result_at(k, T, covariance), is_keyframe=keyframes and k > 0)
+        meter.see(result_at(k, T, covariance), blind_keyframe(T) if keyframes and k > 0 else None)
     return meter
 
 
@@ -111,7 +135,7 @@ def expected_drift(poses, error):
 @pytest.mark.parametrize('axis', [0, 1])
 def test_an_optical_axis_that_is_off_turns_the_path(axis) -> None:
     off = np.eye(4)
-    off[:3, :3] = rotations_by(AXIS_SIGMA_PX / FOCAL_PX * np.eye(3)[axis][None])[0]
+    off[:3, :3] = rotations_by(AXIS_SIGMA_PX / CAMERA.fx * np.eye(3)[axis][None])[0]
     seen = expected_drift(arc(), lambda T: off @ T @ invert(off))
     np.testing.assert_allclose(driven(arc()).drift[:, 6 + axis], seen, rtol=0.05, atol=5e-5)
     assert np.abs(seen).max() > 1e-3
@@ -146,10 +170,10 @@ def test_a_way_back_takes_errors_of_the_calibration_back() -> None:
 def test_a_stretch_without_images_stays_in_odom_when_it_is_over() -> None:
     meter, T = driven(arc()), arc()[-1]
     before, of_stretch = meter.drift, uneven_covariance(np.random.default_rng(3), 20.0)
-    meter.see(result_at(STEPS + 1, T, of_stretch, blind=True), is_keyframe=False)
+    meter.see(result_at(STEPS + 1, T, of_stretch, blind=True), None)
     # While it lasts, it is part of the covariance of the pose.
     np.testing.assert_allclose(meter.drift, before, atol=1e-12)
-    meter.see(result_at(STEPS + 2, T), is_keyframe=False)
+    meter.see(result_at(STEPS + 2, T), None)
     grown = covariance_at(meter.drift, T) - covariance_at(before, T)
     np.testing.assert_allclose(grown, of_stretch, atol=1e-12)
 
@@ -159,5 +183,52 @@ def test_results_that_come_once_more_change_nothing() -> None:
     meter = driven(poses, covariance, keyframes=True)
     before = meter.drift
     for k, T in enumerate(poses):
-        meter.see(result_at(k, T, covariance), is_keyframe=True)
+        meter.see(result_at(k, T, covariance), blind_keyframe(T))
     np.testing.assert_array_equal(meter.drift, before)
+
+
+def test_a_keyframe_that_comes_after_its_pose_counts_once() -> None:
+    """As a node has it: the pose goes out before the map has taken in the keyframe."""
+    poses, covariance = arc(), uneven_covariance(np.random.default_rng(1))
+    at_once, after = driven(poses, covariance, keyframes=True), driven(poses[:1], covariance)
+    for k, T in enumerate(poses[1:], 1):
+        after.see(result_at(k, T, covariance), None)
+        for _ in range(2):
+            after.see(result_at(k, T, covariance), blind_keyframe(T))
+    np.testing.assert_allclose(after.drift, at_once.drift, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize('farthest_m', [2.0, 20.0])
+def test_an_error_of_all_disparities_makes_ways_too_long_or_too_short(farthest_m) -> None:
+    """By as much as poses by points whose disparities are off are, or, where a turn explains some
+    of it, up to three times less: near points say most.
+    """
+    rng = np.random.default_rng(3)
+    T_map_base = se3_exp(np.array([1.0, -0.5, 0.1, 0.2, -0.1, 0.7]))
+    moved = se3_exp(np.array([0.2, -0.05, 0.6, 0.0, 0.1, 0.0]))
+    uv_px, depth_m = rng.uniform((0, 0), (640, 480), (300, 2)), rng.uniform(1.0, farthest_m, 300)
+    true = CAMERA.back_project(uv_px, depth_m)
+    off_m = CAMERA.disparity_times_depth / (
+        CAMERA.disparity_times_depth / depth_m + OFFSET_SIGMA_PX
+    )
+    seen_px = CAMERA.project(transform_points(invert(moved), true))[:, :2].copy()
+    K = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
+    _, turn, way = cv2.solvePnP(CAMERA.back_project(uv_px, off_m), seen_px, K, None)
+    found = invert(np.vstack([np.column_stack([cv2.Rodrigues(turn)[0], way]), [0, 0, 0, 1]]))
+    T_map_left = T_map_base @ T_BASE_LEFT
+    meter = DriftMeter(CAMERA)
+    meter.T_base_left = T_BASE_LEFT
+    seen = keyframe_at(T_map_base, transform_points(T_map_left, true))
+    meter.see(result_at(0, T_map_base), seen)
+    now = T_map_left @ moved @ invert(T_BASE_LEFT)
+    meter.see(result_at(1, now), None)
+    claimed = (covariance_at(meter.drift, now) - without_disparities(T_map_base, now))[:3, :3]
+    error = T_map_left[:3, :3] @ (found[:3, 3] - moved[:3, 3])
+    way = T_map_left[:3, :3] @ moved[:3, 3]
+    along = way / np.linalg.norm(way)
+    assert 0.33 < abs(error @ along) / np.sqrt(along @ claimed @ along) < 1.25
+
+
+def without_disparities(*poses):
+    """Return the covariance (6, 6) of the last pose by errors of the calibration alone."""
+    return covariance_at(driven(poses).drift, poses[-1])
