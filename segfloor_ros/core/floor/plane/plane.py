@@ -262,7 +262,7 @@ def shares(samples: Samples, angles_height: Array) -> tuple[float, float]:
     one, other = np.random.default_rng(0).choice(len(down), size=(2, PROPOSALS))
     slope = (found_px[one] - found_px[other]) / (down[one] - down[other] + 1e-9)
     off_px = found_px - (found_px[one] + slope * (down.T - down[one])).T
-    together = (below.weight @ (np.abs(off_px) < SAME_PX)).max()
+    together = (below.weight @ (np.abs(off_px) < SAME_PX)).max(initial=0.0)
     return float(on) / total, float(together) / total
 
 
