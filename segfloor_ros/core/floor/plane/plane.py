@@ -142,8 +142,8 @@ PROVED = math.log(20)
 class PlaneFit:
     """A refined plane: angles_height (3,) = pitch_rad, roll_rad, height_m of the camera;
     sigma (3,) of them; support: share of the weight of the samples below the plane's horizon
-    that lies on it; violations: share that lies below it. evidence: of the plane of a frame, the
-    logarithm of how much likelier all that is seen is with it than without.
+    that lies on it as a floor does, and violations: that lies together below it. evidence: of the
+    plane of a frame, the logarithm of how much likelier all that is seen is with it than without.
     """
 
     angles_height: Array
