@@ -20,8 +20,7 @@ from segfloor_ros.core.contracts import FrameResult, Keyframe, Mount, StereoFram
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.slam.drift import DriftMeter
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
-from segfloor_ros.nodes.messages import odometry as odoms
-from segfloor_ros.nodes.messages import points, poses
+from segfloor_ros.nodes.messages import odometry, points, poses
 from segfloor_ros.nodes.messages.camera_infos import camera_info_message, rectified_calibration
 from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART, Level
 from segfloor_ros.nodes.messages.images import image_message
@@ -155,20 +154,20 @@ class SlamTopics:
         last, twist, of_twist = self._last, None, None
         if last is not None and last.tracked and result.stamp_ns > last.stamp_ns:
             duration_s = (result.stamp_ns - last.stamp_ns) * 1e-9
-            twist = odoms.body_twist(last.T_odom_base, result.T_odom_base, duration_s)
-            before, now = (odoms.never_certain(one.covariance) for one in (last, result))
-            of_twist = odoms.twist_covariance(before, result.T_odom_base, now, duration_s)
+            twist = odometry.body_twist(last.T_odom_base, result.T_odom_base, duration_s)
+            before, now = (odometry.never_certain(one.covariance) for one in (last, result))
+            of_twist = odometry.twist_covariance(before, result.T_odom_base, now, duration_s)
         own = self._own
         if self._out.listeners('pose' + suffix):
             T_map_base = result.T_map_odom @ result.T_odom_base
             at = result.stamp_ns, own.map_frame
-            in_map = odoms.never_certain(result.covariance_in_map)
-            message = odoms.pose_with_covariance_message(*at, T_map_base, in_map)
+            in_map = odometry.never_certain(result.covariance_in_map)
+            message = odometry.pose_with_covariance_message(*at, T_map_base, in_map)
             self._out.publish('pose' + suffix, message)
-        at, T_odom_base = (result.stamp_ns, own.odom_frame), result.T_odom_base
-        in_odom = odoms.never_certain(self._drift.covariance(result))
-        more: Any = (T_odom_base, in_odom, twist, of_twist)
-        self._out.publish('odometry' + suffix, odoms.odometry_message(*at, own.base_frame, *more))
+        at, T = (result.stamp_ns, own.odom_frame), result.T_odom_base
+        in_odom = odometry.never_certain(self._drift.covariance(result))
+        message = odometry.odometry_message(*at, own.base_frame, T, in_odom, twist, of_twist)
+        self._out.publish('odometry' + suffix, message)
 
     def _publish_keyframe(self, result: FrameResult, keyframe: Keyframe) -> None:
         if keyframe.stamp_ns != self._announced_ns:
@@ -195,8 +194,8 @@ class SlamTopics:
         self._publish_pair(KEYFRAME_PARTS, stamp_ns, (left, right), self._calibration)
         moving = np.zeros_like(left) if moving is None else moving
         out.publish(MOVING_MASK, image_message(stamp_ns, self.frames.left, moving))
-        covariance = odoms.never_certain(result.covariance_in_map)
-        pose = odoms.odometry_message(*at, own.base_frame, T_map_base, covariance)
+        covariance = odometry.never_certain(result.covariance_in_map)
+        pose = odometry.odometry_message(*at, own.base_frame, T_map_base, covariance)
         out.publish('keyframe/odometry', pose)
         out.publish(MAP_START, map_start_message(*at, self.map_start_ns))
 
@@ -319,7 +318,7 @@ class SlamResults:
         # Frames before it was certain come later.
         since_ns = min(self._in_map_since_ns or result.stamp_ns, result.stamp_ns)
         self._in_map_since_ns = since_ns
-        sigmas = np.sqrt(np.diag(odoms.never_certain(result.covariance_in_map)))
+        sigmas = np.sqrt(np.diag(odometry.never_certain(result.covariance_in_map)))
         return {
             'in_map_s': f'{1e-9 * (result.stamp_ns - since_ns):.2f}',
             'place_sigma_m': f'{sigmas[:3].max():.4f}',

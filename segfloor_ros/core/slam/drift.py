@@ -27,14 +27,15 @@ class DriftMeter:
 
     The points of a keyframe lie where the camera had it, and were measured no better than it is by
     those of the one before: each keyframe adds the covariance of its own pose for both. A stretch
-    without images adds that of its end. An error of all disparities makes what is far, and ways by
-    it, too long or too short. T_base_left: (4, 4), the mount, as soon as it is known.
+    without images adds that of its end. An error that all disparities share makes ways too long or
+    too short by a share, the larger the farther the points are that the latest keyframe sees.
+    T_base_left: (4, 4), the mount, as soon as it is known.
     """
 
     def __init__(self, camera: StereoCamera) -> None:
         self.T_base_left: Array = np.eye(4)
         self.drift: Array = np.zeros((6, 10))
-        self._camera, self._off = camera, 0.0
+        self._camera, self._off_share = camera, 0.0
         self._last: FrameResult | None = None
         self._is_keyframe = False
 
@@ -52,8 +53,8 @@ class DriftMeter:
             T_map_left = keyframe.T_map_base @ self.T_base_left
             z_m = (keyframe.features.xyz_map - T_map_left[:3, 3]) @ T_map_left[:3, 2]
             seen_px = self._camera.disparity_times_depth / z_m[np.isfinite(z_m)]
-            # A way is known by points as the squares of their disparities are.
-            self._off = OFFSET_SIGMA_PX * seen_px.sum() / max(seen_px @ seen_px, 1e-9)
+            # Each point says as much of a way as the square of its disparity.
+            self._off_share = OFFSET_SIGMA_PX * seen_px.sum() / max(seen_px @ seen_px, 1e-9)
         if last is not None:
             before, now = (one.T_odom_base @ self.T_base_left for one in (last, result))
             moved = se3_log(invert(before) @ now)
@@ -76,8 +77,8 @@ class DriftMeter:
         way, turn = motion[:3], motion[3:]
         errors: Array = np.zeros((6, 4))
         errors[:, :2] = np.vstack([skew(way), skew(turn)])[:, :2] * -AXIS_SIGMA_PX / self._camera.fx
-        # Of a way, the baseline and the focal length err, and disparities.
-        errors[:3, 2] = np.hypot(np.sqrt(2) * SCALE_SIGMA, self._off) * way
+        # Baseline, focal length and disparities make a way err.
+        errors[:3, 2] = np.hypot(np.sqrt(2) * SCALE_SIGMA, self._off_share) * way
         errors[3:, 3] = SCALE_SIGMA * turn
         return errors
 

@@ -329,9 +329,9 @@ class PlaneSearch:
         guesses = np.concatenate([self._guesses, fresh])
         if len(guesses) == 0:
             return None
-        some = _thinned(frames)
+        some, others = _thinned(frames), _thinned(contrary)
         total = np.sum([scores(few, guesses) for few in some], axis=0)
-        for few in _thinned(contrary):
+        for few in others:
             total += np.minimum(scores(few, guesses), 0)
         total = np.maximum(total, 0) * preference(guesses, travel, mean, SURE * sigma)
         order = np.argsort(-total, kind='stable')[:_KEPT]
@@ -340,7 +340,7 @@ class PlaneSearch:
         fit = refine(Samples.joined(some), guesses[order[0]], self._known, travel, mean, sigma)
         near = [frame.near(fit.angles_height) for frame in frames]
         finer = self._finer(near, fit.angles_height, travel, (mean, sigma))
-        groups = [Samples.joined(few) for few in (some, _thinned(contrary)) if few]
+        groups = [Samples.joined(few) for few in (some, others) if few]
         seen = [shares(few, finer.angles_height) for few in groups]
         fit = replace(finer, support=seen[0][0], violations=max(below for _, below in seen))
         self._guesses = np.concatenate([fit.angles_height[None], guesses[order]])
