@@ -131,7 +131,7 @@ def measure(count: int) -> dict[str, float]:
     own['plan'], closing = once_ms(lambda: plan_closing(sparse_map, [match]))
     own['pose graph'], (poses, _) = once_ms(lambda: optimise(closing.graph))
     own['move'], _ = once_ms(lambda: move_keyframes(sparse_map, poses))
-    own['copy'], adjustment = once_ms(lambda: copy_map(sparse_map, 0.0, None))
+    own['copy'], adjustment = once_ms(lambda: copy_map(sparse_map, None))
     own['global'], result = once_ms(lambda: solve_global(CAMERA, adjustment, lambda: True))
     own['apply'], _ = once_ms(lambda: apply_global(sparse_map, result))
     return own

@@ -40,7 +40,7 @@ from segfloor_ros.core.grid.occupancy import (
     OccupancyGridSettings,
     enlarged,
 )
-from segfloor_ros.core.plugins.maps.known_map import OFFSET, as_seen_by, merge_slam
+from segfloor_ros.core.plugins.maps.known_map import as_seen_by, merge_slam, offset_of
 from segfloor_ros.core.plugins.maps.pruning import prune_file
 from segfloor_ros.core.plugins.maps.saved_slam import (
     PART,
@@ -398,12 +398,9 @@ def _after(first: SavedMap, second: SavedMap) -> MapFile:
     """
     slam, parts = second.slam, second.file.parts
     count, shift_ns = first.slam['num_ever'], gap_ns(first.slam, slam)
-    seen = as_seen_by(
-        saved_camera(first.file, first.name),
-        float(first.slam[OFFSET][0]),
-        saved_camera(second.file, second.name),
-        slam,
-    )
+    camera = saved_camera(first.file, first.name)
+    own = saved_camera(second.file, second.name)
+    seen = as_seen_by(camera, offset_of(camera, first.slam), own, slam)
     ids = slam['point_stable_id'] + count.astype(np.int32)
     stamp_ns = slam['keyframe_stamp_ns'] + shift_ns
     changed = {

@@ -2,8 +2,10 @@
 while it moves; and the model of what it measures.
 
 Cheap stereo cameras bend and warm up: a tenth of a milliradian between the two eyes shifts every
-disparity by the same fraction of a pixel and stretches far distances. A moving rig shows it: the
-parallax between keyframes measures the same points without it.
+disparity by the same fraction of a pixel and stretches far distances. An eye with another focal
+length, or that is rolled, shifts those to the right and below by another one: distances to the left
+are too short, to the right too long, and the path turns. A moving rig shows it: the parallax
+between keyframes measures the same points without it.
 
 A feature measures (u, v, d): its pixel in the left image and its disparity. The disparity is
 found by correlating the patch around (u, v) with the right image, so its error is independent
@@ -33,10 +35,18 @@ solved well within the time between two keyframes."""
 NEIGHBOURS = 2 * LOCAL_KEYFRAMES
 """Keyframes around a view: those that move in a local adjustment, and those that hold them."""
 
+PAIR_SIGMA = 0.001
+"""Expected of a rig: difference of the focal lengths of its eyes, as a share, and roll between
+them, in radians."""
+
 WINDOW_SIGMA_PX = 0.03
 """Error of the estimate from one local adjustment that more points do not average out, px."""
 
-MEMORY_SIGMA_PX = 0.01
+SHOWN_EVERY = LOCAL_KEYFRAMES // 2
+"""Of so many adjustments one is asked for the offset: it shares half its keyframes with the last
+one that was."""
+
+MEMORY_SIGMA_PX = 0.02
 """The estimate never counts as better known than this, so that it can follow the rig, px."""
 
 FITTING = 0.95
@@ -63,46 +73,58 @@ MAX_DISPARITY_SHARE = 0.5
 
 @dataclass(frozen=True)
 class OffsetEstimate:
-    """Value of the offset, measured minus true disparity, and its information in 1/px²."""
+    """The offset, measured minus true disparity: value_px (3,), in the middle of the image, and
+    what more it is at the right edge, and as far below; and its information (3, 3) in 1/px².
+    """
 
-    value_px: float
-    information: float
+    value_px: Array
+    information: Array
 
 
-NO_OFFSET, UNKNOWN_OFFSET = OffsetEstimate(0.0, 1e12), OffsetEstimate(0.0, 0.0)
-"""Disparities are certainly true; nothing is known of them."""
+UNKNOWN_OFFSET = OffsetEstimate(np.zeros(3), np.zeros((3, 3)))
 
 
 class DisparityOffset:
     """Fuses what the local adjustments find of the offset with the expectation that it is 0.
 
-    An information filter on one scalar (Barfoot, State Estimation for Robotics, 2017, section
-    3.3). expected_sigma_px: of the offset before anything is seen, 0 when there is none. share: the
+    An information filter (Barfoot, State Estimation for Robotics, 2017, section 3.3). share: the
     part of an adjustment that is new to the filter; a keyframe takes part in several.
     """
 
-    def __init__(self, expected_sigma_px: float, share: float) -> None:
+    def __init__(self, camera: StereoCamera, share: float = SHOWN_EVERY / LOCAL_KEYFRAMES) -> None:
         self._share = share
-        self._estimating = expected_sigma_px > 0
-        self.estimate = NO_OFFSET
-        if self._estimating:
-            self.estimate = OffsetEstimate(0.0, expected_sigma_px**-2)
+        self._middle, self._half = np.array([camera.cx, camera.cy]), camera.width / 2
+        sigma_px = np.array([OFFSET_SIGMA_PX, *2 * [PAIR_SIGMA * self._half]])
+        self._most_px = MAX_OFFSET_PX / OFFSET_SIGMA_PX * sigma_px
+        self.estimate = OffsetEstimate(np.zeros(3), np.diag(sigma_px**-2))
 
-    @property
-    def value_px(self) -> float:
-        """The present estimate."""
-        return self.estimate.value_px
+    def at(self, uv_px: NDArray[np.floating]) -> Array:
+        """Return the offset (N,) at pixels (N, 2 or more)."""
+        return np.asarray(self.parts_of(uv_px) @ self.estimate.value_px)
+
+    def parts_of(self, uv_px: NDArray[np.floating]) -> Array:
+        """Return what pixels (N, 2 or more) have of each number of the offset (N, 3)."""
+        return np.insert((uv_px[:, :2] - self._middle) / self._half, 0, 1.0, axis=1)
+
+    def take_over(self, numbers: Array) -> None:
+        """Go on with the estimate of a saved map (12,): values and information; of old maps (2,):
+        the offset in the middle alone. Raises ValueError for anything else.
+        """
+        if len(numbers) == 2:
+            self.estimate.value_px[0], self.estimate.information[0, 0] = numbers
+        else:
+            self.estimate = OffsetEstimate(numbers[:3], numbers[3:].reshape(3, 3))
 
     def learn(self, left: OffsetEstimate) -> None:
         """Take in what an adjustment shows of the offset that the present estimate leaves."""
-        known = self.estimate
-        if not self._estimating or left.information <= 0:
-            return
-        seen_px = float(np.clip(known.value_px + left.value_px, -MAX_OFFSET_PX, MAX_OFFSET_PX))
-        weight = self._share / (1.0 / left.information + WINDOW_SIGMA_PX**2)
+        known, seen_px = self.estimate, self.estimate.value_px + left.value_px
+        blurred = np.eye(3) + WINDOW_SIGMA_PX**2 * left.information
+        weight = self._share * np.linalg.solve(blurred, left.information)
         information = known.information + weight
-        value_px = (known.information * known.value_px + weight * seen_px) / information
-        self.estimate = OffsetEstimate(value_px, min(information, MEMORY_SIGMA_PX**-2))
+        mean_px = known.information @ known.value_px + weight @ seen_px
+        value_px = np.clip(np.linalg.solve(information, mean_px), -self._most_px, self._most_px)
+        w, V = np.linalg.eigh(information)
+        self.estimate = OffsetEstimate(value_px, V * np.minimum(w, MEMORY_SIGMA_PX**-2) @ V.T)
 
 
 @dataclass(frozen=True)
@@ -182,9 +204,10 @@ class Rig:
     mount_may_change: bool = False
     base: Mount | None = None
     shutter: RollingShutter = field(default_factory=RollingShutter)
-    offset: DisparityOffset = field(
-        default_factory=lambda: DisparityOffset(OFFSET_SIGMA_PX, 1.0 / LOCAL_KEYFRAMES)
-    )
+    offset: DisparityOffset = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.offset = DisparityOffset(self.camera)
 
     @property
     def base_mount(self) -> Mount | None:
@@ -231,9 +254,11 @@ class Observations:
         """Whether each feature (N,) has a disparity."""
         return np.isfinite(self.uvd_px[:, 2])
 
-    def without_offset(self, offset_px: float) -> Observations:
+    def without_offset(self, offset: DisparityOffset) -> Observations:
         """Return the same measurements with disparities freed of an error they all share."""
-        return Observations(self.uvd_px - (0.0, 0.0, offset_px), self.sigma_px)
+        uvd_px = self.uvd_px.copy()
+        uvd_px[:, 2] -= offset.at(uvd_px)
+        return Observations(uvd_px, self.sigma_px)
 
     @property
     def information(self) -> Array:

@@ -15,7 +15,7 @@ from segfloor_ros.core.plugins.assembly import equipped_slam, make_slam
 from segfloor_ros.core.plugins.maps.known_map import KnownMap, as_seen_by
 from segfloor_ros.core.plugins.maps.map_arrays import fill_map, moved
 from segfloor_ros.core.plugins.maps.saved_slam import base_of, load_slam, mount_of, save_slam
-from segfloor_ros.core.slam.rig import OffsetEstimate, Rig
+from segfloor_ros.core.slam.rig import DisparityOffset, OffsetEstimate, Rig
 from segfloor_ros.core.slam.session import SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import SparseMap
@@ -91,11 +91,24 @@ def test_a_map_of_poses_alone_keeps_the_mount_that_was_measured_and_their_axes()
 
 def test_the_disparity_offset_is_that_of_the_rig_that_made_the_map(mapped):
     before = mapped.rig.offset.estimate
-    mapped.rig.offset.estimate = OffsetEstimate(0.37, 4200.0)
+    value_px, information = np.array([0.37, 0.2, -0.1]), 4e3 * np.eye(3) + 500.0
+    mapped.rig.offset.estimate = OffsetEstimate(value_px, information)
     try:
-        assert loaded(mapped, localize=True).rig.offset.estimate == OffsetEstimate(0.37, 4200.0)
+        found = loaded(mapped, localize=True).rig.offset.estimate
     finally:
         mapped.rig.offset.estimate = before
+    np.testing.assert_array_equal(found.value_px, value_px)
+    np.testing.assert_array_equal(found.information, information)
+
+
+def test_older_maps_know_of_the_offset_in_the_middle_alone():
+    unknown, offset = DisparityOffset(CAMERA).estimate, DisparityOffset(CAMERA)
+    offset.take_over(np.array([0.37, 4200.0]))
+    np.testing.assert_array_equal(offset.estimate.value_px, [0.37, 0.0, 0.0])
+    expected = [4200.0, *np.diag(unknown.information)[1:]]
+    np.testing.assert_array_equal(offset.estimate.information, np.diag(expected))
+    with pytest.raises(ValueError, match='reshape'):
+        offset.take_over(np.zeros(5))
 
 
 def test_saving_again_does_not_grow_the_file(mapped):
@@ -424,14 +437,17 @@ def test_a_map_of_another_camera_is_as_this_one_would_have_measured_it():
     camera = StereoCamera(320, 240, 210.0, 200.0, 165.0, 115.0, 0.07)
     point = np.array([[0.4, -0.3, 2.5]])
 
-    def measured(by, offset_px):
+    def measured(by, middle_px, right_px, below_px):
         u, v, u_right = by.project(point)[0]
-        return [u, v, u - u_right + offset_px]
+        right, below = 2 * (u - by.cx) / by.width, 2 * (v - by.cy) / by.width
+        return [u, v, u - u_right + middle_px + right * right_px + below * below_px]
 
     arrays = {
-        'feature_uvd_px': np.array([measured(own, 0.2)], np.float32),
+        'feature_uvd_px': np.array([measured(own, 0.2, 0.3, -0.5)], np.float32),
         'feature_sigma_px': np.ones((1, 3), np.float16),
-        'disparity_offset': np.array([0.2, 100.0]),
+        'disparity_offset': np.r_[0.2, 0.3, -0.5, np.eye(3).ravel()],
     }
-    found = as_seen_by(camera, -0.4, own, arrays)['feature_uvd_px']
-    np.testing.assert_allclose(found, [measured(camera, -0.4)], atol=1e-3)
+    offset = DisparityOffset(camera)
+    offset.take_over(np.r_[-0.4, 0.1, 0.2, np.eye(3).ravel()])
+    found = as_seen_by(camera, offset, own, arrays)['feature_uvd_px']
+    np.testing.assert_allclose(found, [measured(camera, -0.4, 0.1, 0.2)], atol=1e-3)

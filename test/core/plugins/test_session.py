@@ -5,13 +5,14 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from bundle_problems import CAMERA
 
 from segfloor_ros.core.contracts import FrameResult, LastPose, Mount
 from segfloor_ros.core.plugins.maps import session as sessions
 from segfloor_ros.core.plugins.maps.session import HARDLY_BEGUN, LOST_NS, MapSession
 from segfloor_ros.core.slam import session as core
 from segfloor_ros.core.slam.held_results import HeldResults
-from segfloor_ros.core.slam.rig import NO_OFFSET
+from segfloor_ros.core.slam.rig import DisparityOffset
 from segfloor_ros.core.slam.session import SessionState
 
 MAPPING, RESUMED, LOADED = SessionState.MAPPING, SessionState.RESUMED, SessionState.LOADED
@@ -46,9 +47,7 @@ class Parts:
         mount = Mount(0.3, 0.0, 0.0)
         self.map = SimpleNamespace(
             keyframes=[None] * keyframes,
-            rig=SimpleNamespace(
-                mount=mount, base_mount=mount, offset=SimpleNamespace(estimate=NO_OFFSET)
-            ),
+            rig=SimpleNamespace(mount=mount, base_mount=mount, offset=DisparityOffset(CAMERA)),
         )
         self.sensors, self.moving, self.mount_search = MagicMock(), MagicMock(), MagicMock()
         self.parts = core.Parts(

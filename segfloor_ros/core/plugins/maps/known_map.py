@@ -41,7 +41,7 @@ from segfloor_ros.core.slam.places.place_recognition import (
     Vocabulary,
     greatest_speed_mps,
 )
-from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, OffsetEstimate, Rig, chi2_limit
+from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, DisparityOffset, Rig, chi2_limit
 from segfloor_ros.core.slam.sparse_map import (
     LINK_SIGMA,
     GroundView,
@@ -224,7 +224,7 @@ def merge_slam(first: Arrays, second: Arrays, rig: Rig) -> Arrays | None:
     first, and of the second as the rig of the first would have measured it (`as_seen_by`), with ids
     and stamps that come after those of the first.
     """
-    rig.offset.estimate = OffsetEstimate(*first[OFFSET].tolist())
+    rig.offset = offset_of(rig.camera, first)
     merged = SparseMap(rig)
     fill_map(merged, second)
     known = KnownMap(merged, first, of_drive=False)
@@ -247,19 +247,29 @@ def _close_loops(merged: SparseMap, places: PlaceRecognition, begin: int) -> Non
         if matches:
             closing = plan_closing(merged, matches)
             apply_closing(merged, closing, optimise(closing.graph))
-    copied = copy_map(merged, merged.rig.offset.value_px, None)
+    copied = copy_map(merged, None)
     apply_global(merged, solve_global(merged.rig.camera, copied, lambda: True))
 
 
-def as_seen_by(camera: StereoCamera, offset_px: float, own: StereoCamera, arrays: Arrays) -> Arrays:
+def offset_of(camera: StereoCamera, arrays: Arrays) -> DisparityOffset:
+    """Return what a map knows of the disparity offset. Raises ValueError where it is none."""
+    offset = DisparityOffset(camera)
+    offset.take_over(arrays[OFFSET])
+    return offset
+
+
+def as_seen_by(
+    camera: StereoCamera, offset: DisparityOffset, own: StereoCamera, arrays: Arrays
+) -> Arrays:
     """Return a map, made with camera `own`, as another rectified one would have measured it, whose
     disparities have an offset.
     """
     zoom = np.array([camera.fx / own.fx, camera.fy / own.fy, 1.0])
     zoom[2] = camera.disparity_times_depth / own.disparity_times_depth
-    before = np.array([own.cx, own.cy, float(arrays[OFFSET][0])])
-    now = np.array([camera.cx, camera.cy, offset_px])
-    uvd_px = (arrays['feature_uvd_px'].astype(np.float64) - before) * zoom + now
+    uvd_px = arrays['feature_uvd_px'].astype(np.float64)
+    uvd_px[:, 2] -= offset_of(own, arrays).at(uvd_px)
+    uvd_px = (uvd_px - (own.cx, own.cy, 0.0)) * zoom + (camera.cx, camera.cy, 0.0)
+    uvd_px[:, 2] += offset.at(uvd_px)
     return arrays | {
         'feature_uvd_px': uvd_px.astype(np.float32),
         'feature_sigma_px': (arrays['feature_sigma_px'] * zoom).astype(np.float16),

@@ -19,7 +19,6 @@ from segfloor_ros.core.plugins.maps.known_map import OFFSET, KnownMap, map_and_w
 from segfloor_ros.core.plugins.maps.map_arrays import fill_map
 from segfloor_ros.core.plugins.maps.submap_results import in_merged_map, outside, searched
 from segfloor_ros.core.slam.held_results import left_out
-from segfloor_ros.core.slam.rig import OffsetEstimate
 from segfloor_ros.core.slam.session import OneMap, Parts, SessionState
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord
 from segfloor_ros.core.slam.tracking.images import Images
@@ -91,7 +90,7 @@ class MapSession(OneMap):
         """
         fill_map(self._map, arrays)
         self._back_end.places.from_arrays(arrays)
-        self._map.rig.offset.estimate = OffsetEstimate(*arrays[OFFSET].tolist())
+        self._map.rig.offset.take_over(arrays[OFFSET])
         if last is None:
             self.state = SessionState.LOADED
             self._front_end.reset()
@@ -194,7 +193,7 @@ class MapSession(OneMap):
         """Return the map for a file: the known one while results are held back."""
         self._back_end.collect(wait=True)
         offset = self._map.rig.offset.estimate
-        measured: Arrays = {OFFSET: np.array([offset.value_px, offset.information])}
+        measured: Arrays = {OFFSET: np.r_[offset.value_px, offset.information.ravel()]}
         if self._known is not None and self.state.holds_results:
             return self._known.to_arrays() | measured
         return map_and_words(self._map, self._back_end.places) | measured

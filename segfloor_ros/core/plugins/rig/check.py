@@ -263,8 +263,8 @@ class RigCheck:
         self._calibration.reset_view()
 
     def corrected(self, frame: StereoFrame) -> StereoFrame:
-        """Return a frame with its right image moved, rolled and scaled by what its rows were found
-        to be off.
+        """Return a frame whose right image has the same points in the same rows: moved along the
+        columns or, where it is far off, rolled and scaled as a whole.
         """
         if self._mend is None:
             return frame
@@ -380,6 +380,12 @@ class RigCheck:
             self._mend = None
             rows_px = abs(float(np.median(apart[:, 1])))  # its rest, where speeds vary, has no sign
             self._found_lag(lag_s, self._frame_s, 'right', 'left')
+        else:
+            # The columns of real pairs are not off as their rows are: motion shows how they are.
+            surely = np.array([rows, roll, size])
+            surely[np.abs(surely) < SURE * sigma] = 0.0
+            moved = [surely[1], 1 + surely[2], surely[0] - surely[1:] @ centre]
+            self._mend = np.array([[1, 0, 0], moved]) if surely.any() else None
         self.faults.pop('eyes_swapped', None)
         if negative > 0.5:
             self._found('eyes_swapped', 100 * negative)

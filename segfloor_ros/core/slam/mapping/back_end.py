@@ -190,7 +190,7 @@ class BackEnd:
             self._global.reset()
         if not closing.is_far and (not has_grown or self._global.holds_one):
             return
-        copied = copy_map(self._map, self._rig.offset.value_px, self._up_world)
+        copied = copy_map(self._map, self._up_world)
 
         def apply(result: GlobalResult | None) -> None:
             self._adjusted_keyframes = len(copied.records)

@@ -11,6 +11,7 @@ the keyframes it hangs on (Mur-Artal and Tardos, ORB-SLAM2, IEEE T-RO 2017, sect
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +25,7 @@ from segfloor_ros.core.least_squares import SMALLEST, minimise
 from segfloor_ros.core.slam.mapping.normal_equations import (
     Factors,
     Linearisation,
+    System,
     cost,
     factors_of,
     loop_factors,
@@ -34,6 +36,7 @@ from segfloor_ros.core.slam.rig import (
     LOCAL_KEYFRAMES,
     MIN_DEPTH_M,
     UNKNOWN_OFFSET,
+    DisparityOffset,
     Observations,
     OffsetEstimate,
     huber_cost,
@@ -58,8 +61,8 @@ class BundleProblem:
 
     T_camera_world: (K, 4, 4), the first `num_free` of them move. points_world: (P, 3).
     Observation i (N in total) is of point `point[i]` in keyframe `keyframe[i]`; a pair occurs at
-    most once. factors: what wheels and an accelerometer measured of keyframes. shows_offset:
-    whether the offset that all disparities show is wanted.
+    most once. factors: what wheels and an accelerometer measured of keyframes. offset: of what the
+    adjustment shows how far it is off, None where that is not wanted.
     """
 
     T_camera_world: Array
@@ -69,13 +72,13 @@ class BundleProblem:
     point: NDArray[np.intp]
     observations: Observations
     factors: tuple[Factors, ...] = ()
-    shows_offset: bool = True
+    offset: DisparityOffset | None = None
 
 
 @dataclass(frozen=True)
 class BundleResult:
     """Adjusted poses (K, 4, 4) and points (P, 3), which observations (N,) fit, the cost before
-    and after, and the offset that all disparities show.
+    and after, and the offset that disparities show.
     """
 
     T_camera_world: Array
@@ -110,18 +113,17 @@ def adjust(
     inliers = np.empty(len(order), bool)
     inliers[order] = end.front & (end.chi2 <= adjusted.observations.chi2_limit)
     poses, points = adjusted.T_camera_world, adjusted.points_world
-    return BundleResult(poses, points, inliers, start.cost, end.cost, end.offset)
+    return BundleResult(poses, points, inliers, start.cost, end.cost, end.offset())
 
 
 @dataclass(frozen=True)
 class _State:
     """A problem on trial, with its residuals and cost. Observations are in the order of their
-    keyframes. offset: as the step that led here shows it.
+    keyframes.
     """
 
     camera: StereoCamera
     problem: BundleProblem
-    offset: OffsetEstimate
     points_camera: Array
     residual: Array
     chi2: Array
@@ -129,9 +131,7 @@ class _State:
     cost: float
 
     @staticmethod
-    def at(
-        camera: StereoCamera, problem: BundleProblem, offset: OffsetEstimate = UNKNOWN_OFFSET
-    ) -> _State:
+    def at(camera: StereoCamera, problem: BundleProblem) -> _State:
         """Evaluate a problem."""
         points = problem.points_world[problem.point]
         starts = np.searchsorted(problem.keyframe, np.arange(len(problem.T_camera_world) + 1))
@@ -144,25 +144,11 @@ class _State:
         chi2 = squared_norms(residual, problem.observations.information)
         total = huber_cost(chi2, problem.observations.chi2_limit)
         total += sum(cost(factors, problem.T_camera_world) for factors in problem.factors)
-        return _State(camera, problem, offset, points, residual, chi2, front, total)
+        return _State(camera, problem, points, residual, chi2, front, total)
 
     def linearised(self) -> Callable[[float], tuple[_State, float]]:
         """Return what solves the normal equations for a damping."""
-        problem, observations = self.problem, self.problem.observations
-        weight = huber_weights(self.chi2, observations.chi2_limit)
-        at = Linearisation(
-            problem.T_camera_world,
-            problem.num_free,
-            len(problem.points_world),
-            problem.keyframe,
-            problem.point,
-            self.points_camera,
-            self.residual,
-            observations.information * weight[:, None] * self.front[:, None],
-        )
-        system = normal_equations(self.camera, at)
-        system = system if problem.shows_offset else system.without_shared()
-        system = with_factors(system, problem.T_camera_world, problem.factors)
+        problem, system = self.problem, self._system(self.problem.num_free, None)
 
         def stepped(damping: float) -> tuple[_State, float]:
             step = system.solve(damping)
@@ -171,16 +157,45 @@ class _State:
             candidate = replace(
                 problem, T_camera_world=poses, points_world=problem.points_world + step.shifts
             )
-            trial = _State.at(self.camera, candidate, step.offset)
+            trial = _State.at(self.camera, candidate)
             through = problem.point[self.front & ~trial.front]
             if len(through):
                 candidate.points_world[through] = problem.points_world[through]
-                trial = _State.at(self.camera, candidate, step.offset)
+                trial = _State.at(self.camera, candidate)
             predicted = system.predicted_decrease(step, damping)
             gain = (self.cost - trial.cost) / max(predicted, SMALLEST)
             return trial, max(1 / 3, 1 - (2 * gain - 1) ** 3)
 
         return stepped
+
+    def offset(self) -> OffsetEstimate:
+        """Return how far the offset of the disparities is off. All keyframes are free for it: those
+        that held the others were placed by earlier disparities, with the same error; were they
+        taken for true, each adjustment would confirm those before.
+        """
+        if self.problem.offset is None:
+            return UNKNOWN_OFFSET
+        free = len(self.problem.T_camera_world) - 1
+        return self._system(free, self.problem.offset).solve(0.0).offset
+
+    def _system(self, num_free: int, offset: DisparityOffset | None) -> System:
+        problem, observations = self.problem, self.problem.observations
+        weight = huber_weights(self.chi2, observations.chi2_limit)
+        at = Linearisation(
+            problem.T_camera_world,
+            num_free,
+            len(problem.points_world),
+            problem.keyframe,
+            problem.point,
+            self.points_camera,
+            self.residual,
+            observations.information * weight[:, None] * self.front[:, None],
+            np.zeros((0, len(weight)))
+            if offset is None
+            else offset.parts_of(observations.uvd_px).T,
+        )
+        system = normal_equations(self.camera, at)
+        return with_factors(system, problem.T_camera_world, problem.factors)
 
 
 UNMOVED_M = 1e-6
@@ -205,7 +220,7 @@ class MapCopy:
     features: list[Observations]
     records: list[KeyframeRecord]
     loops: list[LoopEdge]
-    offset_px: float
+    offset: DisparityOffset
     up_world: Up | None
 
 
@@ -222,7 +237,7 @@ class GlobalResult:
     stable_ids: NDArray[np.int32]
 
 
-def copy_map(sparse_map: SparseMap, offset_px: float, up_world: Up | None) -> MapCopy:
+def copy_map(sparse_map: SparseMap, up_world: Up | None) -> MapCopy:
     """Copy what an adjustment needs out of the map: little time between two frames."""
     keyframes = list(sparse_map.keyframes)
     return MapCopy(
@@ -235,7 +250,7 @@ def copy_map(sparse_map: SparseMap, offset_px: float, up_world: Up | None) -> Ma
         [k.observations for k in keyframes],
         keyframes,
         list(sparse_map.loops),
-        offset_px,
+        copy(sparse_map.rig.offset),
         up_world,
     )
 
@@ -270,9 +285,8 @@ def solve_global(
         copied.xyz_world[ids],
         slot[keyframe],
         np.searchsorted(ids, point),
-        gather(copied.features, keyframe, row).without_offset(copied.offset_px),
+        gather(copied.features, keyframe, row).without_offset(copied.offset),
         factors_of(copied.records, slot, copied.up_world) + loop_factors(copied.loops, slot),
-        shows_offset=False,
     )
     adjusted = adjust(camera, problem, is_wanted=is_wanted)
     T_before = np.stack([copied.first_poses[k] for k in early])

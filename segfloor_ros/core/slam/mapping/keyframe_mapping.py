@@ -25,7 +25,7 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     gather,
 )
 from segfloor_ros.core.slam.mapping.normal_equations import factors_of, motion_before
-from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS
+from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, SHOWN_EVERY
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, ENOUGH, MAJORITY, NEARLY_ALL, PROOF
 from segfloor_ros.core.slam.tracking.images import MAX_HAMMING, Images, hamming, one_to_one
@@ -114,9 +114,10 @@ class LocalMapper:
         """Return features (N,) that are measured but belong to no point yet, and where they are."""
         uvd = keyframe.observations.uvd_px
         with np.errstate(invalid='ignore'):
-            measured = uvd[:, 2] - self._rig.offset.value_px >= MIN_DISPARITY_PX
+            disparity = uvd[:, 2] - self._rig.offset.at(uvd)
+            measured = disparity >= MIN_DISPARITY_PX
         rows = np.flatnonzero(measured & (keyframe.point_id == NO_POINT))
-        depth = self._camera.disparity_times_depth / (uvd[rows, 2] - self._rig.offset.value_px)
+        depth = self._camera.disparity_times_depth / disparity[rows]
         points = self._camera.back_project(uvd[rows, :2], depth)
         return rows, transform_points(keyframe.T_world_camera, points)
 
@@ -152,8 +153,9 @@ class LocalMapper:
             self._map.xyz_world[ids],
             slot[edge_keyframe],
             np.searchsorted(ids, edge_point),
-            observations.without_offset(self._rig.offset.value_px),
+            observations.without_offset(self._rig.offset),
             factors_of(self._map.keyframes, slot, up_world),
+            self._rig.offset if keyframe.index % SHOWN_EVERY == 0 else None,
         )
         return Adjustment(keyframe.index, problem, free, ids, edge_keyframe, edge_row, *carried)
 

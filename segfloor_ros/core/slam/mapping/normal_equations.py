@@ -71,8 +71,8 @@ class Step:
 class System:
     """The normal equations by blocks: cameras U (K, 6, 6), points V (3, 3, P), and W (6, 3, M) of
     each pair (keyframe, point[m]) that an observation ties together, those of camera k from
-    starts[k] to starts[k + 1]; right-hand sides. shared: of what all disparities share, an offset
-    and a scale, the products with cameras (K, 6, 2), points (2, 3, P), themselves. between: two
+    starts[k] to starts[k + 1]; right-hand sides. shared: of the offset of all disparities, in S = 0
+    or 3 parts, the products with cameras (K, 6, S), points (S, 3, P), themselves. between: two
     cameras and the block (6, 6) that ties them without points. adjoints (K, 6, 6): of the poses of
     the cameras.
     """
@@ -91,21 +91,13 @@ class System:
     adjoints: Array
     between: tuple[tuple[int, int, Array], ...] = ()
 
-    def without_shared(self) -> System:
-        """Return the system that shows no offset: one right-hand side in place of three."""
-        return replace(
-            self, shared_camera=self.shared_camera[:, :, :0], shared_point=self.shared_point[:0]
-        )
-
     def solve(self, damping: float) -> Step:
         """Solve the damped system by the Schur complement on the cameras, which is sparse: most
         keyframes of a large map share no point.
 
         With V = L L^T by blocks and Y = W L^-T, the complement is U - Y Y^T.
 
-        What the disparities share is not moved by the step, but shown: the offset, whatever the
-        scale. The keyframes that hold the others have a scale by earlier disparities, with the same
-        offset; were it taken for true, each adjustment would confirm the offset of those before.
+        What the disparities share is not moved by the step, but shown.
         """
         diagonal = np.einsum('aap->ap', self.V)
         L_inverse = inverse_cholesky(self.V + np.eye(3)[:, :, None] * (damping * diagonal + 1e-9))
@@ -130,8 +122,9 @@ class System:
         if len(y) == 1:
             return step
         taken = (of_points.T @ of_points + rhs.T @ x)[1:]
-        shown = _first_alone(self.shared_shared - taken[:, 1:], self.shared_rhs - taken[:, 0])
-        return replace(step, offset=shown)
+        information = self.shared_shared - taken[:, 1:] + SMALLEST * np.eye(len(taken))
+        value_px = np.linalg.solve(information, self.shared_rhs - taken[:, 0])
+        return replace(step, offset=OffsetEstimate(value_px, information))
 
     def _blocks(self, L_inverse: Array) -> Array:
         """Return the blocks (6, 3, M) of Y."""
@@ -147,13 +140,6 @@ class System:
             (step.twists * (damping * diagonal_U * step.twists + self.camera_rhs)).sum()
             + (step.shifts * (damping * diagonal_V * step.shifts + self.point_rhs.T)).sum()
         )
-
-
-def _first_alone(A: Array, b: Array) -> OffsetEstimate:
-    """Return the first of two unknowns of A x = b, and its information whatever the second is."""
-    share = A[0, 1] / max(A[1, 1], SMALLEST)
-    information = max(A[0, 0] - share * A[1, 0], SMALLEST)
-    return OffsetEstimate(float((b[0] - share * b[1]) / information), float(information))
 
 
 def inverse_cholesky(A: Array) -> Array:
@@ -188,7 +174,7 @@ def _times_lower(L: Array, v: Array) -> Array:
 class Linearisation:
     """Where the cost is made quadratic. T_camera_world: (K, 4, 4), the first `num_free` move.
     keyframe, point: (N,) of each observation, the keyframes ascending. points_camera, residual,
-    weight: (N, 3).
+    weight: (N, 3). offset_parts: (S, N), see `DisparityOffset`, S = 0 where it is not wanted.
     """
 
     T_camera_world: Array
@@ -199,6 +185,7 @@ class Linearisation:
     points_camera: Array
     residual: Array
     weight: Array
+    offset_parts: Array
 
 
 def normal_equations(camera: StereoCamera, at: Linearisation) -> System:
@@ -208,7 +195,8 @@ def normal_equations(camera: StereoCamera, at: Linearisation) -> System:
     d(point); everything else is these, turned into world axes by A = M R, and moved to the camera's
     twist by (I, p x) (Barfoot 2017, eq. 7.183).
     """
-    J, M, vectors, shared = _in_camera_axes(camera, at)
+    J, M, vectors = _in_camera_axes(camera, at)
+    shared = at.offset_parts
     starts = np.searchsorted(at.keyframe, np.arange(len(at.T_camera_world) + 1))
     A, V, in_world = np.empty_like(M), np.empty_like(M), np.empty_like(vectors)
     for k, T in enumerate(at.T_camera_world):
@@ -238,10 +226,9 @@ def normal_equations(camera: StereoCamera, at: Linearisation) -> System:
     )
 
 
-def _in_camera_axes(camera: StereoCamera, at: Linearisation) -> tuple[Array, Array, Array, Array]:
+def _in_camera_axes(camera: StereoCamera, at: Linearisation) -> tuple[Array, Array, Array]:
     """Return with J = d(u, v, d) / d(point): J^T W^0.5 (3, 3, N), J^T W J (3, 3, N), J^T W of the
-    residuals and of what an offset and a scale change (3, 3, N), and these changes of the
-    disparities (2, N).
+    residuals and of what the offset changes (1 + S, 3, N).
     """
     root = np.sqrt(at.weight.T)
     J = weighted_jacobian(camera, at.points_camera, root)
@@ -251,12 +238,10 @@ def _in_camera_axes(camera: StereoCamera, at: Linearisation) -> tuple[Array, Arr
     M[1, 2] = M[2, 1] = J[1, 1] * J[2, 1]
     M[2, 2] = J[2, 0] ** 2 + J[2, 1] ** 2 + J[2, 2] ** 2
     ru, rv, rd = at.residual.T * root
-    vectors = np.zeros_like(J)
+    vectors = np.zeros((1 + len(at.offset_parts), *J.shape[1:]))
     vectors[0] = J[0, 0] * ru, J[1, 1] * rv, J[2, 0] * ru + J[2, 1] * rv + J[2, 2] * rd
-    shared = np.ones((2, len(root[2])))
-    shared[1] = camera.disparity_times_depth / at.points_camera[:, 2]
-    vectors[1:, 2] = shared * root[2] * J[2, 2]
-    return J, M, vectors, shared
+    vectors[1:, 2] = at.offset_parts * root[2] * J[2, 2]
+    return J, M, vectors
 
 
 def _sum_runs(values: Array, edges: NDArray[np.intp]) -> Array:

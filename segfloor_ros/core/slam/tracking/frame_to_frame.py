@@ -121,7 +121,7 @@ class FrameToFrame:
         """Return what features (N) measure, freed of the disparity offset."""
         observations = Observations.of_pixels(features.uv_px, SIGMA_FLOW_PX)
         measure_disparities(frame, images, observations, np.arange(len(features)))
-        return observations.without_offset(self._rig.offset.value_px)
+        return observations.without_offset(self._rig.offset)
 
 
 def distinct(uv_px: Array) -> NDArray[np.intp]:

@@ -235,7 +235,7 @@ class FrontEnd:
             return replace(track, prior=None)
         # As sure as the patches are.
         rig = self._map.rig
-        seen = track.observations.without_offset(rig.offset.value_px)
+        seen = track.observations.without_offset(rig.offset)
         seen = seen.with_noise_factor(by_images.noise_factor)
         points, start = self._map.xyz_world[track.point_ids], by_images.T_camera_world
         known = rig.camera, start, points, seen, prior

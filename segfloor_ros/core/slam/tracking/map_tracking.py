@@ -139,13 +139,13 @@ class Tracker:
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
-        offset_px = self._map.rig.offset.value_px
+        rig = self._map.rig
         if isinstance(images, Images):
             observations, excluded = features.observations, images.excluded
         else:
             observations, excluded = images, None
         # What was measured in a keyframe is freed of the readout already.
-        readout = self._map.rig.shutter.expected if isinstance(images, Images) else AT_ONCE
+        readout = rig.shutter.expected if isinstance(images, Images) else AT_ONCE
         seen = predict_points(self._map, local_ids, T_camera_world, excluded)
         points, rows, area_px2 = self._search(features, seen, NARROW_PX)
         if len(rows) == 0:
@@ -153,9 +153,9 @@ class Tracker:
         ids = seen.ids[points]
         if isinstance(images, Images):
             align_pixels(images.left, observations, rows, self._map, ids, T_camera_world)
-            guess_px = seen.uvd_px[points, 2] + offset_px
+            guess_px = seen.uvd_px[points, 2] + rig.offset.at(seen.uvd_px[points])
             measure_disparity(images, observations, rows, guess_px)
-        measured = observations.take(rows).without_offset(offset_px)
+        measured = observations.take(rows).without_offset(rig.offset)
         missed, by_chance = len(seen.ids) - len(rows), NARROW_PX * FOUND_PER_PX
         searched = Searched(area_px2, range_of(images, measured), missed, by_chance)
         estimate = self.consensus.refine(T_camera_world, ids, measured, searched, known, readout)
@@ -425,8 +425,7 @@ class Follower:
         self, images: Images, local_ids: NDArray[np.int32], T_predicted: Array
     ) -> Track | None:
         """Find the pose of a frame; None where too little of the last one is found again."""
-        offset_px = self._map.rig.offset.value_px
-        roughly = self._by_flow(images, T_predicted)
+        rig, roughly = self._map.rig, self._by_flow(images, T_predicted)
         if roughly is None:
             return None
         pose = roughly.T_camera_world
@@ -434,7 +433,8 @@ class Follower:
         observations = Observations(seen.uvd_px.copy(), np.ones((len(seen.ids), 3)))
         rows = np.arange(len(seen.ids))
         rows = rows[align_pixels(images.left, observations, rows, self._map, seen.ids, pose)]
-        measure_disparity(images, observations, rows, seen.uvd_px[rows, 2] + offset_px)
+        guess_px = seen.uvd_px[rows, 2] + rig.offset.at(seen.uvd_px[rows])
+        measure_disparity(images, observations, rows, guess_px)
         if len(rows) == 0:
             return None
         ids = seen.ids[rows]
@@ -442,7 +442,7 @@ class Follower:
         searched = Searched(
             4 * ALIGNED_PX**2, range_of(images, measured), len(seen.ids) - len(rows), ALIGNED
         )
-        found = self._consensus.refine(pose, ids, measured.without_offset(offset_px), searched)
+        found = self._consensus.refine(pose, ids, measured.without_offset(rig.offset), searched)
         return Track(found, ids[found.inliers], measured.take(found.inliers), seen.ids)
 
     @timed

@@ -48,7 +48,7 @@ class ObservedFeatures:
         taken to be far away.
         """
         seen, camera = self.observations, rig.camera
-        disparity = np.nan_to_num(seen.uvd_px[:, 2] - rig.offset.value_px)
+        disparity = np.nan_to_num(seen.uvd_px[:, 2] - rig.offset.at(seen.uvd_px))
         depth = camera.disparity_times_depth / np.maximum(disparity, FAR_PX)
         points = camera.back_project(seen.uvd_px[:, :2], depth)
         share = (seen.uvd_px[:, 1] - camera.cy) / camera.height

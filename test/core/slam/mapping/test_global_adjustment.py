@@ -37,7 +37,7 @@ def errors_m(sparse_map):
 
 
 def adjust(sparse_map, meanwhile=lambda: None, up_world=None):
-    copied = copy_map(sparse_map, 0.0, up_world)
+    copied = copy_map(sparse_map, up_world)
     result = solve_global(CAMERA, copied, lambda: True)
     meanwhile()
     apply_global(sparse_map, result)
@@ -94,7 +94,7 @@ def test_a_first_keyframe_that_shows_nothing_stays_beside_the_next(bent):
 
 
 def test_a_large_map_is_adjusted_without_a_factor_and_comes_out_the_same(bent, monkeypatch):
-    copied = copy_map(bent, 0.0, None)
+    copied = copy_map(bent, None)
     by_factor = solve_global(CAMERA, copied, lambda: True)
     monkeypatch.setattr(normal_equations, 'MANY', COUNT // 2)
     monkeypatch.delattr(normal_equations, 'solve_symmetric')
@@ -173,14 +173,14 @@ def test_points_are_where_they_were_adjusted_to_though_a_loop_moved_the_map_mean
         poses = np.stack([k.T_camera_world for k in bent.keyframes])
         move_keyframes(bent, poses @ se3_exp(np.array([moved_m, 0.0, 0.0, 0.0, 0.0, 0.0])))
 
-    cost = solve_global(CAMERA, copy_map(bent, 0.0, None), lambda: True).adjusted.cost_after
+    cost = solve_global(CAMERA, copy_map(bent, None), lambda: True).adjusted.cost_after
     adjust(bent, loop)
-    after = solve_global(CAMERA, copy_map(bent, 0.0, None), lambda: False)
+    after = solve_global(CAMERA, copy_map(bent, None), lambda: False)
     assert after.adjusted.cost_before == pytest.approx(cost, rel=0.01)
 
 
 def test_an_adjustment_that_is_no_longer_wanted_changes_nothing(bent):
     before = np.stack([k.T_camera_world for k in bent.keyframes])
-    copied = copy_map(bent, 0.0, None)
+    copied = copy_map(bent, None)
     apply_global(bent, solve_global(CAMERA, copied, lambda: False))
     np.testing.assert_array_equal(before, np.stack([k.T_camera_world for k in bent.keyframes]))

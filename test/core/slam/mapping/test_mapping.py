@@ -66,11 +66,13 @@ def test_an_adjustment_retires_views_of_what_others_have_seen_as_well(scene):
 
 
 def test_new_points_are_where_their_disparities_without_the_offset_have_them(scene):
-    points, offset_px = scene, 0.4
+    points = scene
     sparse_map = SparseMap(Rig(CAMERA))
-    sparse_map.rig.offset.estimate = OffsetEstimate(offset_px, 1e4)
+    sparse_map.rig.offset.estimate = OffsetEstimate(np.array([0.4, -0.3, 0.2]), np.eye(3))
     keyframe = seen(points, 0, [NO_POINT] * len(points))
-    keyframe.observations.uvd_px[:, 2] += offset_px
+    uvd_px = keyframe.observations.uvd_px
+    right, below = ((uvd_px[:, :2] - (CAMERA.cx, CAMERA.cy)) / (CAMERA.width / 2)).T
+    uvd_px[:, 2] += 0.4 - 0.3 * right + 0.2 * below
     # A camera that is neither at the origin nor level.
     keyframe.T_camera_world = se3_exp(np.array([0.5, -0.2, 1.0, 0.2, -0.4, 0.1]))
     LocalMapper(sparse_map).insert(keyframe, patches(points))

@@ -39,7 +39,7 @@ def driven(frames, wheels):
     wheels: poses of the base every 20 ms.
     """
     slam = equipped_slam(CAMERA, StereoSlamSettings(num_features=600), MOUNT)
-    slam.rig.offset.estimate = OffsetEstimate(OFFSET_PX, 1e4)
+    slam.rig.offset.estimate = OffsetEstimate(np.array([OFFSET_PX, 0.0, 0.0]), 1e4 * np.eye(3))
     learnt, learn = [], slam.sensors.learn
 
     def note(stamp_ns, T_odom_camera, R_world_odom):
