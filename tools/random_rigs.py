@@ -1,9 +1,9 @@
 """Drives that nobody has tried: `python -m tools.random_rigs FOLDER`.
 
-Each seed draws a furnished room, a yard without a roof, a corridor or a room with people, and a rig:
-kind of camera, size of the image, lens, baseline, mount, rate, speed, vibration, floor. Rendered,
-mapped as somebody would who says nothing about the rig, and held against the truth. What is rendered
-is used again; what is mapped is not.
+Each seed draws a place (a furnished room, also with people, a yard without a roof, a corridor) and
+a rig: kind of camera, size of the image, lens, baseline, mount, rate, speed, vibration, floor. It
+is rendered, mapped as somebody would who says nothing of the rig, and held against the truth. What
+is rendered is used again; what is mapped is not.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ import yaml
 from segfloor_ros.apps.cli.main import run_command
 from segfloor_ros.apps.cli.printing import PlainConsole, console
 from segfloor_ros.apps.cli.terminal import announcing, figure_table
+from segfloor_ros.apps.results_folder import read_summary
 from segfloor_ros.apps.simulation.scene_file import open_scene
 from segfloor_ros.apps.simulation.simulation import RecordingOptions, render_once
-from segfloor_ros.apps.results_folder import read_summary
 from segfloor_ros.apps.suite.job import ProgramError, run_segfloor
 from segfloor_ros.apps.suite.measures import measure_run, number, start_pose_of
 from segfloor_ros.core.files.whole import read_json
@@ -160,7 +160,8 @@ def _figures(recording: Path, depth: bool) -> dict[str, str]:
     try:
         run_segfloor(words, recording.with_name(f'{recording.name}.txt'), TIMEOUT_S)
     except ProgramError as error:
-        return dict.fromkeys(MEASURES, '-') | {'tracked_percent': str(error)}
+        console.print(f'{recording}: {error}', highlight=False)
+        return dict.fromkeys(MEASURES, '-')
     measured = measure_run(out, recording, None, start_pose_of(recording))
     measured['pitch_deg'] = math.degrees(read_summary(out / 'summary.json')['camera_pitch_rad'])
     return {name: number(measured[name]) for name in MEASURES}

@@ -38,9 +38,9 @@ from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.files.results import read_map_file, write_map_file
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.plugins.assembly import make_slam
-from segfloor_ros.core.plugins.maps.known_map import as_seen_by, merge_slam, offset_of
+from segfloor_ros.core.plugins.maps.known_map import OFFSET, as_seen_by, merge_slam
 from segfloor_ros.core.plugins.maps.saved_slam import PART, gap_ns, load_slam, mount_of, save_slam
-from segfloor_ros.core.slam.rig import Rig
+from segfloor_ros.core.slam.rig import DisparityOffset, Rig
 from segfloor_ros.nodes.configuration import resolve
 from tools.buildings import KINDS, make_building
 from tools.driving import open_recording
@@ -228,7 +228,8 @@ def measure_merge(drive: Drive, first: MapFile, second: MapFile) -> dict[str, An
         'point_stable_id': b['point_stable_id'] + a['num_ever'].astype(np.int32),
         'num_ever': b['num_ever'] + a['num_ever'],
     }
-    seen = as_seen_by(drive.camera, offset_of(drive.camera, a), drive.camera, b) | later
+    offset = DisparityOffset(drive.camera).of_map(a[OFFSET])
+    seen = as_seen_by(drive.camera, offset, drive.camera, b) | later
     merged = merge_slam(a, seen, Rig(drive.camera, mount_of(first)))
     if merged is None:
         return {'merged': False}

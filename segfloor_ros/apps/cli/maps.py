@@ -40,7 +40,7 @@ from segfloor_ros.core.grid.occupancy import (
     OccupancyGridSettings,
     enlarged,
 )
-from segfloor_ros.core.plugins.maps.known_map import as_seen_by, merge_slam, offset_of
+from segfloor_ros.core.plugins.maps.known_map import OFFSET, as_seen_by, merge_slam
 from segfloor_ros.core.plugins.maps.pruning import prune_file
 from segfloor_ros.core.plugins.maps.saved_slam import (
     PART,
@@ -54,7 +54,7 @@ from segfloor_ros.core.plugins.maps.saved_slam import (
 )
 from segfloor_ros.core.plugins.semantics.label_map import LABELS, LabelMap, Labels
 from segfloor_ros.core.slam.places.loops import SLOPE_SIGMA, UP_SIGMA_M
-from segfloor_ros.core.slam.rig import Rig
+from segfloor_ros.core.slam.rig import DisparityOffset, Rig
 from segfloor_ros.nodes.map_files import check_map_output, save_map
 
 KEEPOUT = 'type: 0, base: 0.0, multiplier: 1.0'
@@ -400,7 +400,8 @@ def _after(first: SavedMap, second: SavedMap) -> MapFile:
     count, shift_ns = first.slam['num_ever'], gap_ns(first.slam, slam)
     camera = saved_camera(first.file, first.name)
     own = saved_camera(second.file, second.name)
-    seen = as_seen_by(camera, offset_of(camera, first.slam), own, slam)
+    offset = DisparityOffset(camera).of_map(first.slam[OFFSET])
+    seen = as_seen_by(camera, offset, own, slam)
     ids = slam['point_stable_id'] + count.astype(np.int32)
     stamp_ns = slam['keyframe_stamp_ns'] + shift_ns
     changed = {

@@ -81,9 +81,6 @@ class OffsetEstimate:
     information: Array
 
 
-UNKNOWN_OFFSET = OffsetEstimate(np.zeros(3), np.zeros((3, 3)))
-
-
 class DisparityOffset:
     """Fuses what the local adjustments find of the offset with the expectation that it is 0.
 
@@ -106,7 +103,7 @@ class DisparityOffset:
         """Return what pixels (N, 2 or more) have of each number of the offset (N, 3)."""
         return np.insert((uv_px[:, :2] - self._middle) / self._half, 0, 1.0, axis=1)
 
-    def take_over(self, numbers: Array) -> None:
+    def of_map(self, numbers: Array) -> DisparityOffset:
         """Go on with the estimate of a saved map (12,): values and information; of old maps (2,):
         the offset in the middle alone. Raises ValueError for anything else.
         """
@@ -114,6 +111,7 @@ class DisparityOffset:
             self.estimate.value_px[0], self.estimate.information[0, 0] = numbers
         else:
             self.estimate = OffsetEstimate(numbers[:3], numbers[3:].reshape(3, 3))
+        return self
 
     def learn(self, left: OffsetEstimate) -> None:
         """Take in what an adjustment shows of the offset that the present estimate leaves."""

@@ -224,7 +224,7 @@ def merge_slam(first: Arrays, second: Arrays, rig: Rig) -> Arrays | None:
     first, and of the second as the rig of the first would have measured it (`as_seen_by`), with ids
     and stamps that come after those of the first.
     """
-    rig.offset = offset_of(rig.camera, first)
+    rig.offset.of_map(first[OFFSET])
     merged = SparseMap(rig)
     fill_map(merged, second)
     known = KnownMap(merged, first, of_drive=False)
@@ -251,13 +251,6 @@ def _close_loops(merged: SparseMap, places: PlaceRecognition, begin: int) -> Non
     apply_global(merged, solve_global(merged.rig.camera, copied, lambda: True))
 
 
-def offset_of(camera: StereoCamera, arrays: Arrays) -> DisparityOffset:
-    """Return what a map knows of the disparity offset. Raises ValueError where it is none."""
-    offset = DisparityOffset(camera)
-    offset.take_over(arrays[OFFSET])
-    return offset
-
-
 def as_seen_by(
     camera: StereoCamera, offset: DisparityOffset, own: StereoCamera, arrays: Arrays
 ) -> Arrays:
@@ -267,7 +260,7 @@ def as_seen_by(
     zoom = np.array([camera.fx / own.fx, camera.fy / own.fy, 1.0])
     zoom[2] = camera.disparity_times_depth / own.disparity_times_depth
     uvd_px = arrays['feature_uvd_px'].astype(np.float64)
-    uvd_px[:, 2] -= offset_of(own, arrays).at(uvd_px)
+    uvd_px[:, 2] -= DisparityOffset(own).of_map(arrays[OFFSET]).at(uvd_px)
     uvd_px = (uvd_px - (own.cx, own.cy, 0.0)) * zoom + (camera.cx, camera.cy, 0.0)
     uvd_px[:, 2] += offset.at(uvd_px)
     return arrays | {

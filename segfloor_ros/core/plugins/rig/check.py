@@ -380,20 +380,17 @@ class RigCheck:
             self._mend = None
             rows_px = abs(float(np.median(apart[:, 1])))  # its rest, where speeds vary, has no sign
             self._found_lag(lag_s, self._frame_s, 'right', 'left')
-        else:
-            # The columns of real pairs are not off as their rows are: motion shows how they are.
-            surely = np.array([rows, roll, size])
-            surely[np.abs(surely) < SURE * sigma] = 0.0
-            moved = [surely[1], 1 + surely[2], surely[0] - surely[1:] @ centre]
-            self._mend = np.array([[1, 0, 0], moved]) if surely.any() else None
         self.faults.pop('eyes_swapped', None)
         if negative > 0.5:
             self._found('eyes_swapped', 100 * negative)
-        if rows_px > ROWS_PX and (lag_s or 'not_simultaneous' not in self.faults):
+        is_apart = rows_px > ROWS_PX and bool(lag_s or 'not_simultaneous' not in self.faults)
+        if is_apart:
             self._found('rows_apart', rows_px)
-            # Roll and size move the columns as well.
-            M = np.array([[size, -roll], [roll, size]])
-            self._mend = np.column_stack([np.eye(2) + M, (0, rows) - M @ centre])
+        if is_apart or not lag_s:
+            # Roll and size move the columns as well; how small ones do, motion shows better.
+            M = np.array([[size * is_apart, -roll * is_apart], [roll, size]])
+            mend = np.column_stack([np.eye(2) + M, (0, rows) - M @ centre])
+            self._mend = mend if (np.abs((rows, roll, size)) > SURE * sigma).any() else None
         if len(self._looks) < RECENT:
             return
         ratio = float(np.exp(np.median(seen[:, 6])))

@@ -35,7 +35,6 @@ from segfloor_ros.core.slam.mapping.normal_equations import (
 from segfloor_ros.core.slam.rig import (
     LOCAL_KEYFRAMES,
     MIN_DEPTH_M,
-    UNKNOWN_OFFSET,
     DisparityOffset,
     Observations,
     OffsetEstimate,
@@ -78,7 +77,7 @@ class BundleProblem:
 @dataclass(frozen=True)
 class BundleResult:
     """Adjusted poses (K, 4, 4) and points (P, 3), which observations (N,) fit, the cost before
-    and after, and the offset that disparities show.
+    and after, and how far the offset of the disparities is off, where that was asked for.
     """
 
     T_camera_world: Array
@@ -86,7 +85,7 @@ class BundleResult:
     inliers: NDArray[np.bool_]
     cost_before: float
     cost_after: float
-    offset: OffsetEstimate
+    offset: OffsetEstimate | None
 
 
 def adjust(
@@ -168,32 +167,23 @@ class _State:
 
         return stepped
 
-    def offset(self) -> OffsetEstimate:
+    def offset(self) -> OffsetEstimate | None:
         """Return how far the offset of the disparities is off. All keyframes are free for it: those
         that held the others were placed by earlier disparities, with the same error; were they
         taken for true, each adjustment would confirm those before.
         """
-        if self.problem.offset is None:
-            return UNKNOWN_OFFSET
-        free = len(self.problem.T_camera_world) - 1
-        return self._system(free, self.problem.offset).solve(0.0).offset
+        free, asked = len(self.problem.T_camera_world) - 1, self.problem.offset
+        return None if asked is None else self._system(free, asked).solve(0.0).offset
 
     def _system(self, num_free: int, offset: DisparityOffset | None) -> System:
         problem, observations = self.problem, self.problem.observations
-        weight = huber_weights(self.chi2, observations.chi2_limit)
+        weight = huber_weights(self.chi2, observations.chi2_limit) * self.front
+        parts = offset.parts_of(observations.uvd_px).T if offset else np.zeros((0, len(weight)))
         at = Linearisation(
-            problem.T_camera_world,
-            num_free,
-            len(problem.points_world),
-            problem.keyframe,
-            problem.point,
-            self.points_camera,
-            self.residual,
-            observations.information * weight[:, None] * self.front[:, None],
-            np.zeros((0, len(weight)))
-            if offset is None
-            else offset.parts_of(observations.uvd_px).T,
-        )
+            problem.T_camera_world, num_free, len(problem.points_world), problem.keyframe,
+            problem.point, self.points_camera, self.residual,
+            observations.information * weight[:, None], parts,
+        )  # fmt: skip
         system = normal_equations(self.camera, at)
         return with_factors(system, problem.T_camera_world, problem.factors)
 

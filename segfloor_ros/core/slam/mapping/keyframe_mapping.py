@@ -113,10 +113,8 @@ class LocalMapper:
     def _new_points(self, keyframe: KeyframeRecord) -> tuple[NDArray[np.intp], Array]:
         """Return features (N,) that are measured but belong to no point yet, and where they are."""
         uvd = keyframe.observations.uvd_px
-        with np.errstate(invalid='ignore'):
-            disparity = uvd[:, 2] - self._rig.offset.at(uvd)
-            measured = disparity >= MIN_DISPARITY_PX
-        rows = np.flatnonzero(measured & (keyframe.point_id == NO_POINT))
+        disparity = np.nan_to_num(uvd[:, 2] - self._rig.offset.at(uvd))
+        rows = np.flatnonzero((disparity >= MIN_DISPARITY_PX) & (keyframe.point_id == NO_POINT))
         depth = self._camera.disparity_times_depth / disparity[rows]
         points = self._camera.back_project(uvd[rows, :2], depth)
         return rows, transform_points(keyframe.T_world_camera, points)
@@ -173,7 +171,8 @@ class LocalMapper:
         kept = result.inliers[adjustment.edge_keyframe == adjustment.newest]
         if len(kept) and kept.mean() < MAJORITY:
             return
-        self._rig.offset.learn(result.offset)
+        if result.offset is not None:
+            self._rig.offset.learn(result.offset)
         self._write_back(adjustment, result)
         outliers = ~result.inliers
         self._map.unlink(adjustment.edge_keyframe[outliers], adjustment.edge_row[outliers])

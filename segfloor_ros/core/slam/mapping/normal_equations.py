@@ -36,7 +36,6 @@ from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.least_squares import SMALLEST
 from segfloor_ros.core.slam.rig import (
     LOCAL_KEYFRAMES,
-    UNKNOWN_OFFSET,
     OffsetEstimate,
     chi2_limit,
     huber_cost,
@@ -59,7 +58,7 @@ FLOOR_SIGMA = np.array([1e-3] * 3 + [1e-4] * 3)
 @dataclass(frozen=True)
 class Step:
     """A solution: twists (K, 6) of the cameras, shifts (P, 3) of the points, and the offset of all
-    disparities that it leaves.
+    disparities that it leaves, in the parts that were asked for.
     """
 
     twists: Array
@@ -118,13 +117,10 @@ class System:
         x = complement.solve(rhs, self.adjoints)
         back = (of_points[:, 0] - complement.Y.T @ x[:, 0]).reshape(-1, 3)
         shifts = np.einsum('bap,pb->pa', L_inverse, back)
-        step = Step(x[:, 0].reshape(-1, 6), shifts, UNKNOWN_OFFSET)
-        if len(y) == 1:
-            return step
         taken = (of_points.T @ of_points + rhs.T @ x)[1:]
         information = self.shared_shared - taken[:, 1:] + SMALLEST * np.eye(len(taken))
-        value_px = np.linalg.solve(information, self.shared_rhs - taken[:, 0])
-        return replace(step, offset=OffsetEstimate(value_px, information))
+        offset_px = np.linalg.solve(information, self.shared_rhs - taken[:, 0])
+        return Step(x[:, 0].reshape(-1, 6), shifts, OffsetEstimate(offset_px, information))
 
     def _blocks(self, L_inverse: Array) -> Array:
         """Return the blocks (6, 3, M) of Y."""
@@ -196,7 +192,6 @@ def normal_equations(camera: StereoCamera, at: Linearisation) -> System:
     twist by (I, p x) (Barfoot 2017, eq. 7.183).
     """
     J, M, vectors = _in_camera_axes(camera, at)
-    shared = at.offset_parts
     starts = np.searchsorted(at.keyframe, np.arange(len(at.T_camera_world) + 1))
     A, V, in_world = np.empty_like(M), np.empty_like(M), np.empty_like(vectors)
     for k, T in enumerate(at.T_camera_world):
@@ -220,8 +215,8 @@ def normal_equations(camera: StereoCamera, at: Linearisation) -> System:
         -of_point[0],
         of_camera[:, :, 1:],
         of_point[1:],
-        (shared * at.weight[:, 2]) @ shared.T,
-        -shared @ (at.weight[:, 2] * at.residual[:, 2]),
+        (at.offset_parts * at.weight[:, 2]) @ at.offset_parts.T,
+        -at.offset_parts @ (at.weight[:, 2] * at.residual[:, 2]),
         adjoint(at.T_camera_world[: at.num_free]),
     )
 
