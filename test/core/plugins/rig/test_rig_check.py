@@ -293,6 +293,40 @@ def test_an_eye_that_is_rolled_and_zoomed_is_mended(frames) -> None:
     assert np.median(error) < np.median(np.abs(off[10].right[inner] - 1.0 * right[inner])) / 4
 
 
+def test_of_small_errors_the_rows_alone_are_taken_off(frames) -> None:
+    turn_deg, larger, down_px = 0.2, 1.003, 0.4
+    M = cv2.getRotationMatrix2D((CAMERA.cx, CAMERA.cy), turn_deg, larger)
+    M[1, 2] += down_px
+    check = RigCheck(CAMERA)
+    off = [replace(f, right=cv2.warpAffine(f.right, M, f.right.shape[::-1])) for f in frames[:21]]
+    for frame in off:
+        check.see(frame)
+    assert check.faults == {}
+    before_px, after_px = (
+        moved_px(frames[20].right, right)
+        for right in (off[20].right, check.corrected(off[20]).right)
+    )
+    # Down, for each pixel to the right, and for each down.
+    rows_off = [down_px, -np.radians(turn_deg), larger - 1]
+    columns_off = [0.0, larger - 1, np.radians(turn_deg)]
+    tolerance = 0.05, 6e-4, 6e-4
+    assert (np.abs(before_px - (columns_off, rows_off)) < tolerance).all()
+    assert (np.abs(after_px - (columns_off, np.zeros(3))) < tolerance).all()
+
+
+def moved_px(image: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return columns and rows (2, 3) by which points are further in another image: in the middle,
+    and more for each pixel to the right and down.
+    """
+    points = cv2.goodFeaturesToTrack(image, 500, 0.01, 5)
+    found, status, _ = cv2.calcOpticalFlowPyrLK(image, other, points, None)
+    here, there = points[status == 1], found[status == 1]
+    off = there - here
+    near = np.abs(off).max(axis=1) < 2
+    A = np.column_stack([np.ones(near.sum()), here[near] - (CAMERA.cx, CAMERA.cy)])
+    return np.linalg.lstsq(A, off[near], rcond=None)[0].T
+
+
 def test_a_chessboard_that_fills_the_view_is_no_fault() -> None:
     K = K_TRUE * np.array([[2.0], [2.0], [1.0]])
     camera = StereoCamera(640, 480, K[0, 0], K[1, 1], K[0, 2], K[1, 2], BASELINE_M)
