@@ -92,7 +92,7 @@ SLAM: dict[str, Mechanism] = {
     'following between keyframes': Mechanism(
         {'core.slam.tracking.map_tracking.Follower.follow': _none}
     ),
-    'disparity offset': Mechanism({'core.slam.rig.OFFSET_SIGMA_PX': 0.0}),
+    'disparity offset': Mechanism({'core.slam.rig.DisparityOffset.learn': lambda *_: None}),
     'bad adjustments left out': Mechanism({'core.slam.mapping.keyframe_mapping.MAJORITY': 0.0}),
     'known views': Mechanism({'core.slam.places.views.NEARLY_ALL': 2.0}),
     'retiring of keyframes': Mechanism(
