@@ -398,10 +398,11 @@ def _after(first: SavedMap, second: SavedMap) -> MapFile:
     """
     slam, parts = second.slam, second.file.parts
     count, shift_ns = first.slam['num_ever'], gap_ns(first.slam, slam)
-    camera = saved_camera(first.file, first.name)
-    own = saved_camera(second.file, second.name)
-    offset = DisparityOffset(camera).of_map(first.slam[OFFSET])
-    seen = as_seen_by(camera, offset, own, slam)
+    offset, own_offset = (
+        DisparityOffset(saved_camera(one.file, one.name)).of_map(one.slam[OFFSET])
+        for one in (first, second)
+    )
+    seen = as_seen_by(offset, own_offset, slam)
     ids = slam['point_stable_id'] + count.astype(np.int32)
     stamp_ns = slam['keyframe_stamp_ns'] + shift_ns
     changed = {

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from segfloor_ros.core.camera.model import MAX_OFFSET_PX, OFFSET_SIGMA_PX, StereoCamera
+from segfloor_ros.core.camera.model import OFFSET_SIGMA_PX, StereoCamera
 from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.least_squares import SMALLEST
@@ -39,8 +39,9 @@ PAIR_SIGMA = 0.001
 """Expected of a rig: difference of the focal lengths of its eyes, as a share, and roll between
 them, in radians."""
 
-WINDOW_SIGMA_PX = 0.03
-"""Error of the estimate from one local adjustment that more points do not average out, px."""
+AS_SURE = 3.0
+"""An adjustment errs by so many times what the noise of its pixels explains: patches that are seen
+from ever nearer are followed with errors that they share."""
 
 SHOWN_EVERY = LOCAL_KEYFRAMES // 2
 """Of so many adjustments one is asked for the offset: it shares half its keyframes with the last
@@ -89,11 +90,10 @@ class DisparityOffset:
     """
 
     def __init__(self, camera: StereoCamera, share: float = SHOWN_EVERY / LOCAL_KEYFRAMES) -> None:
-        self._share = share
-        self._middle, self._half = np.array([camera.cx, camera.cy]), camera.width / 2
-        sigma_px = np.array([OFFSET_SIGMA_PX, *2 * [PAIR_SIGMA * self._half]])
-        self._most_px = MAX_OFFSET_PX / OFFSET_SIGMA_PX * sigma_px
-        self.estimate = OffsetEstimate(np.zeros(3), np.diag(sigma_px**-2))
+        self.camera, self._share = camera, share
+        sigma_px = np.array([OFFSET_SIGMA_PX, *2 * [PAIR_SIGMA * camera.width / 2]])
+        self._expected = np.diag(sigma_px**-2)
+        self.estimate = OffsetEstimate(np.zeros(3), self._expected.copy())
 
     def at(self, uv_px: NDArray[np.floating]) -> Array:
         """Return the offset (N,) at pixels (N, 2 or more)."""
@@ -101,26 +101,28 @@ class DisparityOffset:
 
     def parts_of(self, uv_px: NDArray[np.floating]) -> Array:
         """Return what pixels (N, 2 or more) have of each number of the offset (N, 3)."""
-        return np.insert((uv_px[:, :2] - self._middle) / self._half, 0, 1.0, axis=1)
+        from_middle = uv_px[:, :2] - (self.camera.cx, self.camera.cy)
+        return np.insert(from_middle / (self.camera.width / 2), 0, 1.0, axis=1)
 
     def of_map(self, numbers: Array) -> DisparityOffset:
         """Go on with the estimate of a saved map (12,): values and information; of old maps (2,):
         the offset in the middle alone. Raises ValueError for anything else.
         """
-        if len(numbers) == 2:
-            self.estimate.value_px[0], self.estimate.information[0, 0] = numbers
-        else:
-            self.estimate = OffsetEstimate(numbers[:3], numbers[3:].reshape(3, 3))
+        parts = 1 if len(numbers) == 2 else 3
+        self.estimate.value_px[:parts] = numbers[:parts]
+        self.estimate.information[:parts, :parts] = numbers[parts:].reshape(parts, parts)
         return self
 
     def learn(self, left: OffsetEstimate) -> None:
-        """Take in what an adjustment shows of the offset that the present estimate leaves."""
-        known, seen_px = self.estimate, self.estimate.value_px + left.value_px
-        blurred = np.eye(3) + WINDOW_SIGMA_PX**2 * left.information
-        weight = self._share * np.linalg.solve(blurred, left.information)
-        information = known.information + weight
-        mean_px = known.information @ known.value_px + weight @ seen_px
-        value_px = np.clip(np.linalg.solve(information, mean_px), -self._most_px, self._most_px)
+        """Take in what an adjustment shows of the offset that the present estimate leaves. An
+        offset that no rig has is none: where all points lie on a floor, another scale looks alike.
+        """
+        known, added = self.estimate, left.information / AS_SURE**2
+        seen_px = known.value_px + left.value_px
+        unlike = added - added @ np.linalg.solve(self._expected + added, added)
+        share = self._share * float(seen_px @ unlike @ seen_px < chi2_limit(3, GATE))
+        information = known.information + share * added
+        value_px = known.value_px + share * np.linalg.solve(information, added @ left.value_px)
         w, V = np.linalg.eigh(information)
         self.estimate = OffsetEstimate(value_px, V * np.minimum(w, MEMORY_SIGMA_PX**-2) @ V.T)
 
@@ -254,9 +256,9 @@ class Observations:
 
     def without_offset(self, offset: DisparityOffset) -> Observations:
         """Return the same measurements with disparities freed of an error they all share."""
-        uvd_px = self.uvd_px.copy()
-        uvd_px[:, 2] -= offset.at(uvd_px)
-        return Observations(uvd_px, self.sigma_px)
+        return Observations(
+            self.uvd_px - np.outer(offset.at(self.uvd_px), (0, 0, 1)), self.sigma_px
+        )
 
     @property
     def information(self) -> Array:

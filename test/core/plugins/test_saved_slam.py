@@ -447,7 +447,7 @@ def test_a_map_of_another_camera_is_as_this_one_would_have_measured_it():
         'feature_sigma_px': np.ones((1, 3), np.float16),
         'disparity_offset': np.r_[0.2, 0.3, -0.5, np.eye(3).ravel()],
     }
-    offset = DisparityOffset(camera)
-    offset.of_map(np.r_[-0.4, 0.1, 0.2, np.eye(3).ravel()])
-    found = as_seen_by(camera, offset, own, arrays)['feature_uvd_px']
+    offset = DisparityOffset(camera).of_map(np.r_[-0.4, 0.1, 0.2, np.eye(3).ravel()])
+    own_offset = DisparityOffset(own).of_map(arrays['disparity_offset'])
+    found = as_seen_by(offset, own_offset, arrays)['feature_uvd_px']
     np.testing.assert_allclose(found, [measured(camera, -0.4, 0.1, 0.2)], atol=1e-3)

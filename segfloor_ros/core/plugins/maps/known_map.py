@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import NO_POINT, Mount
 from segfloor_ros.core.files.arrays import Arrays
 from segfloor_ros.core.geometry import Array, invert, transform_points
@@ -251,16 +250,15 @@ def _close_loops(merged: SparseMap, places: PlaceRecognition, begin: int) -> Non
     apply_global(merged, solve_global(merged.rig.camera, copied, lambda: True))
 
 
-def as_seen_by(
-    camera: StereoCamera, offset: DisparityOffset, own: StereoCamera, arrays: Arrays
-) -> Arrays:
-    """Return a map, made with camera `own`, as another rectified one would have measured it, whose
-    disparities have an offset.
+def as_seen_by(offset: DisparityOffset, own_offset: DisparityOffset, arrays: Arrays) -> Arrays:
+    """Return a map, made with a camera of its own, as another rectified one would have measured it;
+    disparities of both have an offset.
     """
+    camera, own = offset.camera, own_offset.camera
     zoom = np.array([camera.fx / own.fx, camera.fy / own.fy, 1.0])
     zoom[2] = camera.disparity_times_depth / own.disparity_times_depth
     uvd_px = arrays['feature_uvd_px'].astype(np.float64)
-    uvd_px[:, 2] -= DisparityOffset(own).of_map(arrays[OFFSET]).at(uvd_px)
+    uvd_px[:, 2] -= own_offset.at(uvd_px)
     uvd_px = (uvd_px - (own.cx, own.cy, 0.0)) * zoom + (camera.cx, camera.cy, 0.0)
     uvd_px[:, 2] += offset.at(uvd_px)
     return arrays | {

@@ -377,7 +377,6 @@ class RigCheck:
         rows_px = self.rows_px = max(rows_px, float(bent_px))
         if lag_s:
             self.faults.pop('rows_apart', None)  # it may have been the lag
-            self._mend = None
             rows_px = abs(float(np.median(apart[:, 1])))  # its rest, where speeds vary, has no sign
             self._found_lag(lag_s, self._frame_s, 'right', 'left')
         self.faults.pop('eyes_swapped', None)
@@ -386,11 +385,10 @@ class RigCheck:
         is_apart = rows_px > ROWS_PX and bool(lag_s or 'not_simultaneous' not in self.faults)
         if is_apart:
             self._found('rows_apart', rows_px)
-        if is_apart or not lag_s:
-            # Roll and size move the columns as well; how small ones do, motion shows better.
-            M = np.array([[size * is_apart, -roll * is_apart], [roll, size]])
-            mend = np.column_stack([np.eye(2) + M, (0, rows) - M @ centre])
-            self._mend = mend if (np.abs((rows, roll, size)) > SURE * sigma).any() else None
+        # Roll and size move the columns as well; how small ones do, motion shows better.
+        M = np.array([[size * is_apart, -roll * is_apart], [roll, size]])
+        mend = np.column_stack([np.eye(2) + M, (0, rows) - M @ centre])
+        self._mend = mend if is_apart or (bent_px > 0 and not lag_s) else None
         if len(self._looks) < RECENT:
             return
         ratio = float(np.exp(np.median(seen[:, 6])))

@@ -177,12 +177,12 @@ class _State:
 
     def _system(self, num_free: int, offset: DisparityOffset | None) -> System:
         problem, observations = self.problem, self.problem.observations
-        weight = huber_weights(self.chi2, observations.chi2_limit) * self.front
+        robust = huber_weights(self.chi2, observations.chi2_limit) * self.front
+        weight = observations.information * robust[:, None]
         parts = offset.parts_of(observations.uvd_px).T if offset else np.zeros((0, len(weight)))
         at = Linearisation(
             problem.T_camera_world, num_free, len(problem.points_world), problem.keyframe,
-            problem.point, self.points_camera, self.residual,
-            observations.information * weight[:, None], parts,
+            problem.point, self.points_camera, self.residual, weight, parts,
         )  # fmt: skip
         system = normal_equations(self.camera, at)
         return with_factors(system, problem.T_camera_world, problem.factors)

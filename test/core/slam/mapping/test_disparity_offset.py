@@ -109,15 +109,28 @@ def test_the_information_is_that_of_the_eliminated_system():
 
 def test_the_filter_weighs_what_it_is_given():
     offset = DisparityOffset(VGA, share=1.0)
-    # Expected are 0.1 px, and 0.001 of half the width; what is sure counts as known to 0.03 px.
-    offset.learn(OffsetEstimate(np.array([0.2, 0.3, -0.1]), np.diag([1e9, 1e9, 0.0])))
-    weight, known = 1 / 0.03**2, np.array([1 / 0.1**2, 1 / 0.32**2])
+    # Expected are 0.1 px, and 0.001 of half the width; what shows errs by three of its sigmas.
+    offset.learn(OffsetEstimate(np.array([0.2, 0.3, -0.1]), np.diag([1e4, 2500.0, 0.0])))
+    weight, known = np.array([0.03, 0.06]) ** -2, np.array([0.1, 0.32]) ** -2
     expected = np.array([0.2, 0.3]) * weight / (known + weight)
     np.testing.assert_allclose(offset.estimate.value_px, [*expected, 0.0], rtol=1e-3)
     before = offset.estimate
     offset.learn(OffsetEstimate(np.full(3, 0.4), np.zeros((3, 3))))
     np.testing.assert_allclose(offset.estimate.value_px, before.value_px)
     np.testing.assert_allclose(offset.estimate.information, before.information)
+
+
+def test_what_no_rig_has_is_not_learnt():
+    # A floor alone shows no offset that grows as its disparities do: that is another scale.
+    offset = DisparityOffset(VGA, share=1.0)
+    along = np.array([0.35, -0.03, 0.94])
+    information = np.eye(3) * 1e-6 + np.outer(along, along)
+    before = offset.estimate
+    offset.learn(OffsetEstimate(70.0 * along, information))
+    np.testing.assert_allclose(offset.estimate.value_px, before.value_px)
+    np.testing.assert_allclose(offset.estimate.information, before.information)
+    offset.learn(OffsetEstimate(0.1 * along, 1e3 * information))
+    assert offset.estimate.value_px @ along > 0.05
 
 
 def test_of_parts_that_are_known_together_the_filter_learns_no_more():
@@ -134,8 +147,8 @@ def test_of_parts_that_are_known_together_the_filter_learns_no_more():
 def test_the_filter_never_runs_away_nor_grows_sure():
     offset = DisparityOffset(VGA, share=0.5)
     for _ in range(2000):
-        offset.learn(OffsetEstimate(np.array([5.0, -5.0, 5.0]), 1000.0 * np.eye(3)))
-    np.testing.assert_allclose(offset.estimate.value_px, [0.5, -1.6, 1.6])
+        offset.learn(OffsetEstimate(np.array([0.3, -0.3, 0.3]), 1000.0 * np.eye(3)))
+    assert (np.abs(offset.estimate.value_px) <= [0.5, 1.6, 1.6]).all()
     assert np.linalg.eigvalsh(offset.estimate.information).max() <= 1.0001 / MEMORY_SIGMA_PX**2
 
 
