@@ -39,7 +39,7 @@ PAIR_SIGMA = 0.001
 """Expected of a rig: difference of the focal lengths of its eyes, as a share, and roll between
 them, in radians."""
 
-AS_SURE = 3.0
+UNDERRATED = 3.0
 """An adjustment errs by so many times what the noise of its pixels explains: patches that are seen
 from ever nearer are followed with errors that they share."""
 
@@ -117,7 +117,7 @@ class DisparityOffset:
         """Take in what an adjustment shows of the offset that the present estimate leaves. An
         offset that no rig has is none: where all points lie on a floor, another scale looks alike.
         """
-        known, added = self.estimate, left.information / AS_SURE**2
+        known, added = self.estimate, left.information / UNDERRATED**2
         seen_px = known.value_px + left.value_px
         unlike = added - added @ np.linalg.solve(self._expected + added, added)
         share = self._share * float(seen_px @ unlike @ seen_px < chi2_limit(3, GATE))
