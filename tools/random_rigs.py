@@ -131,7 +131,7 @@ def random_rigs(
         typer.Option(help='Figures of an earlier --json: they stand before the arrows.'),
     ] = None,
 ) -> None:
-    """Print a row for each rig. What has no map has the last word of the program in its row."""
+    """Print a row for each rig; for one that has no map also why, as the program says it."""
     before = read_json(compare, 'figures of tools.random_rigs') if compare else {}
     folder.mkdir(parents=True, exist_ok=True)
     table = figure_table('rig', *MEASURES.values())

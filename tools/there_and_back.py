@@ -228,7 +228,7 @@ def measure_merge(drive: Drive, first: MapFile, second: MapFile) -> dict[str, An
         'point_stable_id': b['point_stable_id'] + a['num_ever'].astype(np.int32),
         'num_ever': b['num_ever'] + a['num_ever'],
     }
-    offset, own = (DisparityOffset(drive.camera).of_map(one[OFFSET]) for one in (a, b))
+    offset, own = (DisparityOffset(drive.camera).restored(one[OFFSET]) for one in (a, b))
     seen = as_seen_by(offset, own, b) | later
     merged = merge_slam(a, seen, Rig(drive.camera, mount_of(first)))
     if merged is None:

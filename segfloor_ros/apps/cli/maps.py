@@ -399,7 +399,7 @@ def _after(first: SavedMap, second: SavedMap) -> MapFile:
     slam, parts = second.slam, second.file.parts
     count, shift_ns = first.slam['num_ever'], gap_ns(first.slam, slam)
     offset, own_offset = (
-        DisparityOffset(saved_camera(one.file, one.name)).of_map(one.slam[OFFSET])
+        DisparityOffset(saved_camera(one.file, one.name)).restored(one.slam[OFFSET])
         for one in (first, second)
     )
     seen = as_seen_by(offset, own_offset, slam)

@@ -104,9 +104,9 @@ class DisparityOffset:
         from_middle = uv_px[:, :2] - (self.camera.cx, self.camera.cy)
         return np.insert(from_middle / (self.camera.width / 2), 0, 1.0, axis=1)
 
-    def of_map(self, numbers: Array) -> DisparityOffset:
-        """Go on with the estimate of a saved map (12,): values and information; of old maps (2,):
-        the offset in the middle alone. Raises ValueError for anything else.
+    def restored(self, numbers: Array) -> DisparityOffset:
+        """Take over the numbers of a saved map, (12,) values and information, of older maps (2,)
+        those of the middle alone, and return this. Raises ValueError for anything else.
         """
         parts = 1 if len(numbers) == 2 else 3
         self.estimate.value_px[:parts] = numbers[:parts]
@@ -117,12 +117,13 @@ class DisparityOffset:
         """Take in what an adjustment shows of the offset that the present estimate leaves. An
         offset that no rig has is none: where all points lie on a floor, another scale looks alike.
         """
-        known, added = self.estimate, left.information / UNDERRATED**2
-        seen_px = known.value_px + left.value_px
+        old, added = self.estimate, left.information / UNDERRATED**2
+        seen_px = old.value_px + left.value_px
         unlike = added - added @ np.linalg.solve(self._expected + added, added)
-        share = self._share * float(seen_px @ unlike @ seen_px < chi2_limit(3, GATE))
-        information = known.information + share * added
-        value_px = known.value_px + share * np.linalg.solve(information, added @ left.value_px)
+        if seen_px @ unlike @ seen_px > chi2_limit(3, GATE):
+            return
+        information = old.information + self._share * added
+        value_px = old.value_px + np.linalg.solve(information, self._share * added @ left.value_px)
         w, V = np.linalg.eigh(information)
         self.estimate = OffsetEstimate(value_px, V * np.minimum(w, MEMORY_SIGMA_PX**-2) @ V.T)
 
@@ -255,10 +256,9 @@ class Observations:
         return np.isfinite(self.uvd_px[:, 2])
 
     def without_offset(self, offset: DisparityOffset) -> Observations:
-        """Return the same measurements with disparities freed of an error they all share."""
-        return Observations(
-            self.uvd_px - np.outer(offset.at(self.uvd_px), (0, 0, 1)), self.sigma_px
-        )
+        """Return the same measurements with disparities freed of their offset."""
+        off_px = np.outer(offset.at(self.uvd_px), (0, 0, 1))
+        return Observations(self.uvd_px - off_px, self.sigma_px)
 
     @property
     def information(self) -> Array:

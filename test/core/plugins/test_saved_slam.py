@@ -103,12 +103,12 @@ def test_the_disparity_offset_is_that_of_the_rig_that_made_the_map(mapped):
 
 def test_older_maps_know_of_the_offset_in_the_middle_alone():
     unknown, offset = DisparityOffset(CAMERA).estimate, DisparityOffset(CAMERA)
-    offset.of_map(np.array([0.37, 4200.0]))
+    offset.restored(np.array([0.37, 4200.0]))
     np.testing.assert_array_equal(offset.estimate.value_px, [0.37, 0.0, 0.0])
     expected = [4200.0, *np.diag(unknown.information)[1:]]
     np.testing.assert_array_equal(offset.estimate.information, np.diag(expected))
     with pytest.raises(ValueError, match='reshape'):
-        offset.of_map(np.zeros(5))
+        offset.restored(np.zeros(5))
 
 
 def test_saving_again_does_not_grow_the_file(mapped):
@@ -447,7 +447,7 @@ def test_a_map_of_another_camera_is_as_this_one_would_have_measured_it():
         'feature_sigma_px': np.ones((1, 3), np.float16),
         'disparity_offset': np.r_[0.2, 0.3, -0.5, np.eye(3).ravel()],
     }
-    offset = DisparityOffset(camera).of_map(np.r_[-0.4, 0.1, 0.2, np.eye(3).ravel()])
-    own_offset = DisparityOffset(own).of_map(arrays['disparity_offset'])
+    offset = DisparityOffset(camera).restored(np.r_[-0.4, 0.1, 0.2, np.eye(3).ravel()])
+    own_offset = DisparityOffset(own).restored(arrays['disparity_offset'])
     found = as_seen_by(offset, own_offset, arrays)['feature_uvd_px']
     np.testing.assert_allclose(found, [measured(camera, -0.4, 0.1, 0.2)], atol=1e-3)

@@ -223,7 +223,7 @@ def merge_slam(first: Arrays, second: Arrays, rig: Rig) -> Arrays | None:
     first, and of the second as the rig of the first would have measured it (`as_seen_by`), with ids
     and stamps that come after those of the first.
     """
-    rig.offset.of_map(first[OFFSET])
+    rig.offset.restored(first[OFFSET])
     merged = SparseMap(rig)
     fill_map(merged, second)
     known = KnownMap(merged, first, of_drive=False)

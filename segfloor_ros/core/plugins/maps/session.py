@@ -90,7 +90,7 @@ class MapSession(OneMap):
         """
         fill_map(self._map, arrays)
         self._back_end.places.from_arrays(arrays)
-        self._map.rig.offset.of_map(arrays[OFFSET])
+        self._map.rig.offset.restored(arrays[OFFSET])
         if last is None:
             self.state = SessionState.LOADED
             self._front_end.reset()

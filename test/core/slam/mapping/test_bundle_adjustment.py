@@ -163,7 +163,7 @@ def test_a_solution_by_the_complement_is_that_of_all_unknowns_at_once():
         found = [step.twists.ravel(), step.shifts.ravel()]
         np.testing.assert_allclose(np.concatenate(found), expected, atol=1e-7)
         np.testing.assert_allclose(step.offset.value_px, offset.value_px, atol=1e-7)
-        np.testing.assert_allclose(step.offset.information, offset.information, rtol=1e-5)
+        np.testing.assert_allclose(step.offset.information, offset.information, rtol=1e-6)
         alone = without.solve(1e-3)
         np.testing.assert_allclose(alone.twists, step.twists, atol=1e-9)
         np.testing.assert_allclose(alone.shifts, step.shifts, atol=1e-9)
