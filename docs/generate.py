@@ -22,7 +22,7 @@ from segfloor_ros.nodes.messages.topics import (
     ROBOT,
     SLAM,
     Topic,
-    describe,
+    describe_policies,
     published_by,
     subscribed_by,
 )
@@ -206,14 +206,15 @@ def page(node: str) -> str:
 
 
 def _topics(topics: list[Topic], are_published: bool = False) -> str:
+    profiles = [t.offered if are_published else t.profile for t in topics]
     rows = [
         (
             f'`{t.name}`',
             f'`{t.type_name}`',
-            describe(t.offered if are_published else t.profile),
+            f'{describe_policies(profile)}, depth {profile.depth}',
             ABOUT[t.name],
         )
-        for t in topics
+        for t, profile in zip(topics, profiles, strict=True)
     ]
     return _table(('topic', 'type', 'QoS', 'what it holds'), rows) if rows else ''
 

@@ -109,7 +109,7 @@ class Row:
 @dataclasses.dataclass(frozen=True)
 class Published:
     """Poses of the camera T_odom_left (N, 4, 4), NaN where lost, and the covariance (N, 6, 6) of a
-    twist that is multiplied from the right, in the axes of the camera. drift: (N, 6, 10), of odom.
+    twist that is multiplied from the right, in the axes of the camera. drift: (N, 6, 13), of odom.
     """
 
     stamp_ns: Array
@@ -221,7 +221,7 @@ def measure(
 
 
 def as_published(results: Sequence[FrameResult], drift: Array, mount: Mount) -> Published:
-    """Return poses and covariances of the camera from those of the base. drift: (N, 6, 10).
+    """Return poses and covariances of the camera from those of the base. drift: (N, 6, 13).
 
     The covariance of the base has the axes of `odom` at the base: turned to those of the base it is
     that of a twist from the right, and the adjoint of the mount brings it to the camera.

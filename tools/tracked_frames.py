@@ -32,7 +32,7 @@ UNCERTAIN = 'uncertain'
 @dataclasses.dataclass(frozen=True)
 class TrackedFrames:
     """SLAM over N frames. results: of each frame, as it was published last, without keyframes;
-    frames that are in no map at the end are not tracked. drift: (N, 6, 10), of odom (see
+    frames that are in no map at the end are not tracked. drift: (N, 6, 13), of odom (see
     `core.slam.drift`). T_map_left: (N, 4, 4), the rectified left camera, every frame carried along
     by its keyframe's final pose; NaN where it is not tracked. seconds: CPU time of the calling
     thread.

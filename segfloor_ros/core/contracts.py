@@ -173,7 +173,8 @@ class MovingPoints:
 @dataclass(frozen=True)
 class Keyframe:
     """Everything published about one keyframe. All parts share its stamp. moving: mask (H, W)
-    uint8 of the left image, 255 where something moves.
+    uint8 of the left image, 255 where something moves. offset_px2: covariance (3, 3) of what
+    disparities are still off, in the middle of the image, at its right edge and as far below.
     """
 
     stamp_ns: int
@@ -185,6 +186,7 @@ class Keyframe:
     path: KeyframePath
     cloud: SparseCloud
     moving: NDArray[np.uint8] | None = None
+    offset_px2: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 @dataclass(frozen=True)

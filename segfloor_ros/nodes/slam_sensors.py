@@ -37,6 +37,7 @@ from segfloor_ros.nodes.messages.topics import (
     PATIENCE_S,
     SENSORS,
     best_effort,
+    stamp_of,
     to_ns,
 )
 from segfloor_ros.nodes.shared.inputs import DISCOVERY_S, LOOK_S
@@ -117,8 +118,8 @@ class SensorInput:
     def _due(self, stamp_ns: int) -> Iterator[Odometry | Imu]:
         """Yield the messages of each sensor up to the first at or after a time."""
         for name, waiting in self._waiting.items():
-            in_order = sorted(waiting, key=_stamp_ns)
-            count = bisect_left(in_order, stamp_ns, key=_stamp_ns) + 1
+            in_order = sorted(waiting, key=stamp_of)
+            count = bisect_left(in_order, stamp_ns, key=stamp_of) + 1
             yield from in_order[:count]
             self._waiting[name] = deque(in_order[count:], SENSORS.depth)
 
@@ -191,13 +192,9 @@ class SensorInput:
         return self._T_left_imu
 
     def _note(self, name: str, message: Odometry | Imu) -> None:
-        latest_ns = max(_stamp_ns(message), self._latest.get(name, (0, 0.0))[0])
+        latest_ns = max(stamp_of(message), self._latest.get(name, (0, 0.0))[0])
         self._latest[name] = latest_ns, self._clock_s()
         self._on_message()
-
-
-def _stamp_ns(message: Odometry | Imu) -> int:
-    return to_ns(message.header.stamp)
 
 
 class MaskInput:
@@ -260,16 +257,14 @@ class InitialPose:
             self._given = None
 
     def _take(self, message: PoseWithCovarianceStamped) -> None:
-        if message.header.frame_id not in ('', self._map_frame):
-            its, own = message.header.frame_id, self._map_frame
-            text = f'{INITIAL_POSE} is in frame {its}; give it in {own}'
+        its, own = message.header.frame_id, self._map_frame
+        text = '' if its in ('', own) else f'{INITIAL_POSE} is in frame {its}; give it in {own}'
+        if not np.isfinite(message.pose.covariance).all():
+            text = f'{INITIAL_POSE}: its covariance is not finite; give numbers, or zeros'
+        if text:
             self._node.reporter.diagnose(INITIAL_POSE, text, lasts_s=PATIENCE_S)
             return
         T_map_base = pose_array(message.pose.pose)
-        if not np.isfinite(message.pose.covariance).all():
-            text = f'{INITIAL_POSE}: its covariance is not finite; give numbers, or zeros'
-            self._node.reporter.diagnose(INITIAL_POSE, text, lasts_s=PATIENCE_S)
-            return
         sigma = np.sqrt(np.maximum(np.diag(np.reshape(message.pose.covariance, (6, 6))), 0.0))
         sigmas = float(np.sqrt(chi2_limit(1, GATE)))
         reach_m = sigmas * max(float(sigma[:3].max()), LEAST_SIGMA_M)

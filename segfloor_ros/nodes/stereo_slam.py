@@ -177,12 +177,11 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         found = stamps.take(stamp_ns)
         step_s = 0.0 if last_ns is None else 1e-9 * (stamp_ns - last_ns)
         if found in (InTime.LATE, InTime.ELSEWHERE):
-            words = {
-                InTime.LATE: 'older than the pair before it; dropped',
-                InTime.ELSEWHERE: f'its stamp is {step_s:.3f} s from the one before; dropped',
-            }
+            words = f'its stamp is {step_s:.3f} s from the one before; dropped'
+            if found is InTime.LATE:
+                words = 'older than the pair before it; dropped'
             self.reporter.health.count('dropped')
-            self.reporter.report(stamp_ns, Level.ERROR, words[found])
+            self.reporter.report(stamp_ns, Level.ERROR, words)
             return False
         if found is InTime.JUMPED and step_s < 0:
             self.reset(f'the stamps of the images went back by {-step_s:.3f} s')

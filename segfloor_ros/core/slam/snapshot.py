@@ -38,15 +38,14 @@ def take_snapshot(
     features = KeyframeFeatures(uv_px.astype(np.float32), point_id, xyz)
     shown = frame.stamp_ns, frame.index, keyframe.T_world_camera, frame.left, frame.right
     path, cloud = path_of(sparse_map.keyframes), cloud_of(sparse_map)
-    return Keyframe(*shown, features, path, cloud, moving)
+    offset_px2 = np.linalg.inv(sparse_map.rig.offset.estimate.information)
+    return Keyframe(*shown, features, path, cloud, moving, offset_px2)
 
 
 def path_of(keyframes: Sequence[KeyframeRecord]) -> KeyframePath:
     """Return the poses of keyframes."""
-    return KeyframePath(
-        np.array([k.stamp_ns for k in keyframes], np.int64),
-        np.stack([k.T_world_camera for k in keyframes]),
-    )
+    stamp_ns = np.array([k.stamp_ns for k in keyframes], np.int64)
+    return KeyframePath(stamp_ns, np.stack([k.T_world_camera for k in keyframes]))
 
 
 def cloud_of(sparse_map: SparseMap) -> SparseCloud:

@@ -121,11 +121,6 @@ def best_effort(profile: QoSProfile) -> QoSProfile:
     return QoSProfile(depth=profile.depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-def describe(profile: QoSProfile) -> str:
-    """Return a profile in words, e.g. `reliable, volatile, depth 30`."""
-    return f'{describe_policies(profile)}, depth {profile.depth}'
-
-
 def describe_policies(profile: QoSProfile) -> str:
     """Return what both sides must agree on in words, e.g. `reliable, volatile`."""
     words = (profile.reliability.name, profile.durability.name)
@@ -282,10 +277,9 @@ def subscribed_by(node: str, alternatives: bool = False) -> list[Topic]:
     """Return the topics a node subscribes to, without diagnostics; alternatives: also those that
     replace others by parameter, and those on demand.
     """
-    mine = [topic for topic in TOPICS.values() if node in topic.subscribers]
-    if not alternatives:
-        return [topic for topic in mine if not topic.instead_of]
-    return [t for t in TOPICS.values() if t in mine or node in t.on_demand_by]
+    by_default = [t for t in TOPICS.values() if node in t.subscribers and not t.instead_of]
+    every = [t for t in TOPICS.values() if node in (*t.subscribers, *t.on_demand_by)]
+    return every if alternatives else by_default
 
 
 def stamp_of(message: Any) -> int:

@@ -324,7 +324,9 @@ class Connections:
 
     def find_problems(self) -> None:
         """Report topics that do not connect, a node of the same name, and queues that grow."""
-        self._find_incompatible()
+        sides = self._publishers.values(), self._subscriptions.values()
+        for topic, text in incompatible_topics(self._node, *sides):
+            self._reporter.diagnose(f'QoS of {topic}', text, Level.ERROR)
         self._find_silent()
         self._find_twin()
         topic, waited_s = self._reporter.health.longest_wait()
@@ -334,11 +336,6 @@ class Connections:
                 'lower the rate or the size of the images, or let stereo_slam make fewer keyframes'
             )
             self._reporter.diagnose('queues', text)
-
-    def _find_incompatible(self) -> None:
-        sides = self._publishers.values(), self._subscriptions.values()
-        for topic, text in incompatible_topics(self._node, *sides):
-            self._reporter.diagnose(f'QoS of {topic}', text, Level.ERROR)
 
     def _find_silent(self) -> None:
         """Report inputs that nobody publishes, each with what is published that looks like it."""

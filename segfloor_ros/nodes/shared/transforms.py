@@ -73,11 +73,8 @@ class Transforms:
 
     def mount_is_settled(self, camera_frame: str) -> bool:
         """Whether tf tells the mount of the left optical frame, or had time enough to."""
-        if (
-            not self._link.is_there
-            or self._mounted is not None
-            or self.mount(camera_frame) is not None
-        ):
+        is_told = self._mounted is not None or self.mount(camera_frame) is not None
+        if is_told or not self._link.is_there:
             return True
         base, wait_s = self._own.base_frame, self._own.tf_wait_s
         if not self._is_published():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sampled_poses import assert_spread, drawn_errors, uneven_covariance
 
-from segfloor_ros.core.camera.model import OFFSET_SIGMA_PX, StereoCamera
+from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import (
     FrameResult,
     Keyframe,
@@ -51,18 +51,18 @@ def result_at(k, T_odom_base, covariance=NOTHING, **more):
     )
 
 
-def keyframe_at(T_map_base, xyz_map):
-    """Return a keyframe that sees points (N, 3)."""
+def keyframe_at(T_map_base, xyz_map, uv_px, offset_px2=NOTHING[:3, :3]):
+    """Return a keyframe that sees points (N, 3) at pixels (N, 2)."""
     ids, image = np.arange(len(xyz_map), dtype=np.int32), np.zeros((0, 0), np.uint8)
-    features = KeyframeFeatures(np.zeros((len(ids), 2), np.float32), ids, xyz_map)
+    features = KeyframeFeatures(uv_px.astype(np.float32), ids, xyz_map)
     path = KeyframePath(np.zeros(1, np.int64), T_map_base[None])
     cloud = SparseCloud(ids, xyz_map)
-    return Keyframe(0, 0, T_map_base, image, image, features, path, cloud)
+    return Keyframe(0, 0, T_map_base, image, image, features, path, cloud, offset_px2=offset_px2)
 
 
 def blind_keyframe(T_map_base):
     """Return a keyframe that sees nothing."""
-    return keyframe_at(T_map_base, np.zeros((0, 3)))
+    return keyframe_at(T_map_base, np.zeros((0, 3)), np.zeros((0, 2)))
 
 
 def driven(poses, covariance=NOTHING, keyframes=False):
@@ -198,37 +198,48 @@ def test_a_keyframe_that_comes_after_its_pose_counts_once() -> None:
     np.testing.assert_allclose(after.drift, at_once.drift, rtol=1e-9, atol=1e-15)
 
 
-@pytest.mark.parametrize('farthest_m', [2.0, 20.0])
-def test_an_error_of_all_disparities_makes_ways_too_long_or_too_short(farthest_m) -> None:
-    """By as much as poses by points whose disparities are off are, or, where a turn explains some
-    of it, up to three times less: near points say most.
-    """
-    rng = np.random.default_rng(3)
-    T_map_base = se3_exp(np.array([1.0, -0.5, 0.1, 0.2, -0.1, 0.7]))
-    moved = se3_exp(np.array([0.2, -0.05, 0.6, 0.0, 0.1, 0.0]))
-    uv_px, depth_m = rng.uniform((0, 0), (640, 480), (300, 2)), rng.uniform(1.0, farthest_m, 300)
-    true = CAMERA.back_project(uv_px, depth_m)
-    off_m = CAMERA.disparity_times_depth / (
-        CAMERA.disparity_times_depth / depth_m + OFFSET_SIGMA_PX
-    )
-    seen_px = CAMERA.project(transform_points(invert(moved), true))[:, :2].copy()
+def moved_by_pixels(points, points_seen, moved):
+    """Return the motion (4, 4) of a camera that takes points (N, 3) for points_seen (N, 3)."""
+    uv_px = CAMERA.project(transform_points(invert(moved), points))[:, :2].copy()
     K = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
-    _, turn, way = cv2.solvePnP(CAMERA.back_project(uv_px, off_m), seen_px, K, None)
-    found = invert(np.vstack([np.column_stack([cv2.Rodrigues(turn)[0], way]), [0, 0, 0, 1]]))
-    T_map_left = T_map_base @ T_BASE_LEFT
+    start = [part.reshape(3, 1) for part in np.split(se3_logs(invert(moved)[None])[0], 2)]
+    _, turn, way = cv2.solvePnP(points_seen, uv_px, K, None, start[1], start[0], True)
+    return invert(np.vstack([np.column_stack([cv2.Rodrigues(turn)[0], way]), [0, 0, 0, 1]]))
+
+
+@pytest.mark.parametrize('farthest_m', [2.0, 20.0])
+def test_errors_of_all_disparities_bend_the_path_as_poses_by_such_points_do(farthest_m) -> None:
+    """Uneven ones that have errors in common, on a pitched mount, in a turn."""
+    rng = np.random.default_rng(3)
+    T_map_left = se3_exp(np.array([1.0, -0.5, 0.1, 0.2, -0.1, 0.7])) @ T_BASE_LEFT
+    moved = se3_exp(np.array([0.002, -0.0005, 0.006, 0.0, 0.001, 0.0]))
+    # Most on one side, and far ones at the top: no two numbers do the same.
+    uv_px = np.array([640, 480]) * rng.beta((1.0, 1.5), (2.0, 1.0), (300, 2))
+    depth_m = rng.uniform(1.0, farthest_m, 300) * (1.5 - uv_px[:, 1] / 480)
+    true, fb = CAMERA.back_project(uv_px, depth_m), CAMERA.disparity_times_depth
+    parts = np.column_stack([np.ones(300), (uv_px - (CAMERA.cx, CAMERA.cy)) / 320])
+    effects = []
+    for part in 0.05 * parts.T:
+        more, less = (
+            moved_by_pixels(true, CAMERA.back_project(uv_px, fb / (fb / depth_m + off)), moved)
+            for off in (part, -part)
+        )
+        error = T_map_left @ more @ invert(T_map_left @ less)
+        effects.append(se3_logs(error[None])[0] / 0.1)
+    mixed = np.array([[0.1, 0.0, 0.0], [-0.04, 0.08, 0.0], [0.05, 0.02, 0.03]])
     meter = DriftMeter(CAMERA)
     meter.T_base_left = T_BASE_LEFT
-    seen = keyframe_at(T_map_base, transform_points(T_map_left, true))
+    T_map_base, now = (T @ invert(T_BASE_LEFT) for T in (T_map_left, T_map_left @ moved))
+    seen = keyframe_at(T_map_base, transform_points(T_map_left, true), uv_px, mixed @ mixed.T)
     meter.see(result_at(0, T_map_base), seen)
-    now = T_map_left @ moved @ invert(T_BASE_LEFT)
     meter.see(result_at(1, now), None)
-    claimed = (covariance_at(meter.drift, now) - without_disparities(T_map_base, now))[:3, :3]
-    error = T_map_left[:3, :3] @ (found[:3, 3] - moved[:3, 3])
-    way = T_map_left[:3, :3] @ moved[:3, 3]
-    along = way / np.linalg.norm(way)
-    assert 0.33 < abs(error @ along) / np.sqrt(along @ claimed @ along) < 1.25
-
-
-def without_disparities(*poses):
-    """Return the covariance (6, 6) of the last pose by errors of the calibration alone."""
-    return covariance_at(driven(poses).drift, poses[-1])
+    claimed = meter.drift[:, 10:] @ meter.drift[:, 10:].T
+    expected = np.transpose(effects) @ mixed @ mixed.T @ effects
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        claimed / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.05
+    )
+    blind = DriftMeter(CAMERA)
+    blind.see(result_at(0, T_map_base), blind_keyframe(T_map_base))
+    blind.see(result_at(1, now), None)
+    assert not blind.drift[:, 10:].any()

@@ -15,7 +15,7 @@ from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.geometry import make_transform, transform_points
 from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.mapping.bundle_adjustment import adjust
-from segfloor_ros.core.slam.rig import MEMORY_SIGMA_PX, DisparityOffset, OffsetEstimate
+from segfloor_ros.core.slam.rig import MEMORY_SIGMA_PX, PAIR_SIGMA, DisparityOffset, OffsetEstimate
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.twists import se3_exp
 
@@ -212,6 +212,15 @@ def test_the_path_of_eyes_with_unlike_focal_lengths_hardly_turns(focal):
     # A larger right image has larger u there: to the right disparities are smaller.
     assert slam.rig.offset.estimate.value_px[1] == pytest.approx(-focal * CAMERA.width / 2, abs=0.1)
     assert yaw(results) < 0.5 * yaw(believed)
+
+
+@pytest.mark.slow
+def test_keyframes_tell_how_well_the_offset_is_known_by_then():
+    _, results = room_drive()
+    told = [result.keyframe.offset_px2 for result in results if result.keyframe is not None]
+    pair_px = PAIR_SIGMA * CAMERA.width / 2
+    np.testing.assert_allclose(told[0], np.diag([OFFSET_SIGMA_PX, pair_px, pair_px]) ** 2)
+    assert (np.diag(told[-1]) < 0.5 * np.diag(told[0])).all()
 
 
 def yaw(results):
