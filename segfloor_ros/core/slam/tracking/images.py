@@ -40,6 +40,11 @@ from segfloor_ros.core.timing import timed
 SIDE_PX = 11
 """Of the patch around a pixel: small enough to be flat, large enough to be distinct."""
 
+BLUR_PX = 1.0
+"""Standard deviation of the Gaussian that images are smoothed by before patches are compared: the
+scale of their slopes. Slopes of noise say that a patch lies where its search starts.
+"""
+
 SMALL_WIDTH_PX = 320
 """Width of a shrunk image: for optical flow; half of it shows what moves, a quarter turns."""
 STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.05)
@@ -84,9 +89,9 @@ Matches = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 @dataclass(frozen=True)
 class Images:
-    """left, right: rectified grey images (H, W) float32, for patches; of a depth camera its
-    disparity for the right one, and depth_scale: disparity times depth, 0 of a stereo pair. small:
-    the left one as optical flow takes it. moving: where something moves, in the left image;
+    """left, right: rectified grey images (H, W) float32, smoothed, for patches; of a depth camera
+    its disparity for the right one, and depth_scale: disparity times depth, 0 of a stereo pair.
+    small: the left one as optical flow takes it. moving: where something moves, in the left image;
     excluded: there, and in the black border that rectification leaves.
     """
 
@@ -101,10 +106,15 @@ class Images:
     def of(frame: StereoFrame, camera: StereoCamera, border: Region | None = None) -> Images:
         """Prepare the images of a frame. border: that rectification leaves in the left one."""
         depth_scale = camera.disparity_times_depth if is_disparity(frame.right) else 0.0
-        left, right = frame.left.astype(np.float32), frame.right.astype(np.float32)
+        left, right = smooth(frame.left), frame.right if depth_scale else smooth(frame.right)
         said = frame.excluded
         moving = None if said is None else dilate(said)
         return Images(left, right, shrink(frame.left), union(border, moving), depth_scale, moving)
+
+
+def smooth(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the image (H, W) as patches are compared in."""
+    return cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR_PX)
 
 
 def shrink(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -12,6 +12,7 @@ itself, a plain face not at all. Patches that overlap hold the same pixels and e
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -23,7 +24,7 @@ from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.slam.rig import MAX_DISPARITY_SHARE, SAME_PX, Observations
 from segfloor_ros.core.slam.thresholds import MAJORITY
-from segfloor_ros.core.slam.tracking.images import SIDE_PX, SMALL_WIDTH_PX, Images
+from segfloor_ros.core.slam.tracking.images import BLUR_PX, SIDE_PX, SMALL_WIDTH_PX, Images
 from segfloor_ros.core.timing import timed
 
 HALF_PATCH_PX = SIDE_PX // 2
@@ -39,6 +40,9 @@ AFFINE_SIGMA = 0.3
 GREY_NOISE = 2.0
 """Standard deviation of a grey level that the camera alone explains; a lower residual is luck, and
 an image that varies by less shows nothing."""
+
+SHARED_PX2 = 4 * math.pi * BLUR_PX**2
+"""Pixels of a smoothed image that have the noise of one in common."""
 
 ALIGNED_PX = 2.0
 """From so far away a patch is brought to where it lies, by no more than half of it in one step."""
@@ -121,7 +125,7 @@ def align_patches(
         W = warp[:, :, moving]
         noise[moving], rhs = fit.misfit(image, W)
         if iteration == 0:
-            prior = np.maximum(noise, GREY_NOISE**2) * of_level
+            prior = np.maximum(SHARED_PX2 * noise, GREY_NOISE**2) * of_level
             H = fit.H
             for unknown in range(3 * axes):
                 H[unknown, unknown] += prior * (AFFINE_SIGMA**-2 if unknown % 3 else 1e-9)
@@ -138,7 +142,7 @@ def align_patches(
         if not still.any():
             break
         fit, moving = fit.take(still), moving[still]
-    level = np.maximum(noise, GREY_NOISE**2) * of_level
+    level = np.maximum(SHARED_PX2 * noise, GREY_NOISE**2) * of_level
     sigma: Array = np.zeros((2, count))
     variance = np.maximum(np.einsum('aan->an', inverse)[::3], known) * level
     sigma[:axes] = zoom * np.sqrt(np.maximum(variance, 0.0))
@@ -153,7 +157,7 @@ def known_shift(energy: Array) -> Array:
     (axes, axes, N) of their slopes, freed of what noise and the sampling of an edge show of slopes
     that are none.
     """
-    noise = GREY_NOISE**2 / 2
+    noise = GREY_NOISE**2 / (8 * math.pi * BLUR_PX**4)
     if len(energy) == 1:
         return np.asarray(1 / np.maximum(energy[0] - noise, LEAST_ENERGY))
     (a, b), (_, c) = energy
