@@ -270,11 +270,6 @@ class Observations:
         return Observations(self.uvd_px, self.sigma_px * factor)
 
     @property
-    def chi2_median(self) -> Array:
-        """The median (N,) of the squared, normalised residual of each feature when all is well."""
-        return np.where(np.isfinite(self.uvd_px[:, 2]), chi2_limit(3, 0.5), chi2_limit(2, 0.5))
-
-    @property
     def chi2_limit(self) -> Array:
         """The 95 % bound (N,) on the squared, normalised residual of each feature."""
         return np.where(np.isfinite(self.uvd_px[:, 2]), chi2_limit(3), chi2_limit(2))

@@ -203,7 +203,8 @@ def normal_equations(camera: StereoCamera, at: Linearisation) -> System:
     p = at.points_camera[free].T
     J = with_moment(p, J[:, :, free])
     U = [J[..., a:b].reshape(6, -1) for a, b in pairwise(edges)]
-    of_camera = _sum_runs(with_moment(p, np.swapaxes(vectors[:, :, free], 0, 1)), edges)
+    moments = with_moment(p, np.swapaxes(vectors[:, :, free], 0, 1))
+    of_camera = np.stack([moments[..., a:b].sum(axis=-1) for a, b in pairwise(edges)])
     of_point = _sum_by(at.point, in_world, at.num_points)
     return System(
         np.stack([J_k @ J_k.T for J_k in U]),
@@ -237,11 +238,6 @@ def _in_camera_axes(camera: StereoCamera, at: Linearisation) -> tuple[Array, Arr
     vectors[0] = J[0, 0] * ru, J[1, 1] * rv, J[2, 0] * ru + J[2, 1] * rv + J[2, 2] * rd
     vectors[1:, 2] = at.offset_parts * root[2] * J[2, 2]
     return J, M, vectors
-
-
-def _sum_runs(values: Array, edges: NDArray[np.intp]) -> Array:
-    """Return the sums (K, ...) over the last axis between each edge and the next (K + 1,)."""
-    return np.stack([values[..., a:b].sum(axis=-1) for a, b in pairwise(edges)])
 
 
 def _sum_by(index: NDArray[np.intp], values: Array, size: int) -> Array:

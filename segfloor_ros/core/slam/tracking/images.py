@@ -41,9 +41,7 @@ SIDE_PX = 11
 """Of the patch around a pixel: small enough to be flat, large enough to be distinct."""
 
 BLUR_PX = 1.0
-"""Standard deviation of the Gaussian that images are smoothed by before patches are compared: the
-scale of their slopes. Slopes of noise say that a patch lies where its search starts.
-"""
+"""Scale of the slopes that patches are aligned by."""
 
 SMALL_WIDTH_PX = 320
 """Width of a shrunk image: for optical flow; half of it shows what moves, a quarter turns."""
@@ -107,13 +105,14 @@ class Images:
         """Prepare the images of a frame. border: that rectification leaves in the left one."""
         depth_scale = camera.disparity_times_depth if is_disparity(frame.right) else 0.0
         left, right = smooth(frame.left), frame.right if depth_scale else smooth(frame.right)
-        said = frame.excluded
-        moving = None if said is None else dilate(said)
+        moving = None if frame.excluded is None else dilate(frame.excluded)
         return Images(left, right, shrink(frame.left), union(border, moving), depth_scale, moving)
 
 
 def smooth(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the image (H, W) as patches are compared in."""
+    """Return the image (H, W) in which patches are compared: slopes of noise say that a patch lies
+    where its search starts, so there are none.
+    """
     return cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR_PX)
 
 

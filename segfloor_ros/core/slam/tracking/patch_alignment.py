@@ -33,9 +33,7 @@ STEPS, SETTLED_PX = 4, 0.02
 noise of the template makes each a half or more of what is missing."""
 
 AFFINE_SIGMA = 0.3
-"""Prior standard deviation of the affine part, px per px; the floor under a low camera reaches
-0.5.
-"""
+"""Prior deviation of the affine part, px per px; the floor under a low camera reaches 0.5."""
 
 GREY_NOISE = 2.0
 """Standard deviation of a grey level that the camera alone explains; a lower residual is luck, and
@@ -52,9 +50,6 @@ MIN_SIGMA_PIXEL, MIN_SIGMA_DISPARITY = 0.15, 0.1
 
 MIN_TEXTURE = 5
 """Of a block that is matched roughly, in units of OpenCV."""
-
-MIN_CORRELATION = 0.7
-"""Of the patches of one point in both images."""
 
 MAX_STEP = np.array([ALIGNED_PX / 2, AFFINE_SIGMA, AFFINE_SIGMA])[:, None]
 
@@ -415,8 +410,7 @@ def refine_disparity(
     if reach_px > 0:
         score = correlation_along_row(template, right, uv_right, reach_px)
         peak = score.argmax(axis=1)
-        inside = (peak > 0) & (peak < 2 * reach_px)
-        rows = np.flatnonzero(inside & (score[rows, peak] >= MIN_CORRELATION))
+        rows = np.flatnonzero((peak > 0) & (peak < 2 * reach_px))
         uv_right[rows, 0] += peak[rows] - reach_px
     found = align_patches(template[rows], right, uv_right[rows], np.ones(len(rows)), along_row=True)
     rows, found_u = rows[found.sound], found.uv_px[found.sound, 0]

@@ -28,6 +28,7 @@ from segfloor_ros.core.slam.rig import (
     Observations,
     Readout,
     Rig,
+    chi2_limit,
     huber_cost,
     huber_weights,
     is_gated,
@@ -282,7 +283,8 @@ class _Seen:
         np.multiply(certainty, scale, out=rows[3:6].T)
         from_centre = observations.uvd_px - (camera.cx, camera.cy, 0.0)
         rows[6:9] = np.where(measured, from_centre * certainty, 0.0).T
-        rows[9], rows[10] = observations.chi2_limit, observations.chi2_median
+        rows[9] = observations.chi2_limit
+        rows[10] = np.where(measured[:, 2], chi2_limit(3, 0.5), chi2_limit(2, 0.5))
         rows[11] = from_centre[:, 1] / camera.height
         return _Seen(rows)
 
