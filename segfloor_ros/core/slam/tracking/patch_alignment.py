@@ -120,7 +120,7 @@ def align_patches(
         W = warp[:, :, moving]
         noise[moving], rhs = fit.misfit(image, W)
         if iteration == 0:
-            prior = np.maximum(SHARED_PX2 * noise, GREY_NOISE**2) * of_level
+            prior = np.maximum(noise, GREY_NOISE**2) * of_level
             H = fit.H
             for unknown in range(3 * axes):
                 H[unknown, unknown] += prior * (AFFINE_SIGMA**-2 if unknown % 3 else 1e-9)

@@ -11,6 +11,7 @@ from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.rig import Observations
 from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
+from segfloor_ros.core.slam.tracking.images import smooth
 from segfloor_ros.core.slam.tracking.patch_alignment import (
     MIN_SIGMA_DISPARITY,
     MIN_SIGMA_PIXEL,
@@ -43,7 +44,7 @@ def noisy(image):
 
 def sigmas_px(image, uv_px):
     """Return the standard deviations (N, 3) of pixels (N, 2) and disparities, by their patches."""
-    grey, zoom = image.astype(np.float32), np.ones(len(uv_px))
+    grey, zoom = smooth(image), np.ones(len(uv_px))
     patches = sample_patches(grey, uv_px)
     by_pixel = align_patches(patches, grey, uv_px, zoom).sigma_px
     by_row = align_patches(patches, grey, uv_px, zoom, along_row=True).sigma_px
