@@ -11,6 +11,7 @@ import numpy as np
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.camera.pixels import BlankBorder, Region
 from segfloor_ros.core.contracts import (
+    NO_POINT,
     UNKNOWN_COVARIANCE,
     FrameResult,
     Keyframe,
@@ -264,8 +265,8 @@ class StereoSlam:
             points = transform_points(keyframe.T_camera_world, self.map.xyz_world[ids])
             gone = ids[self._moving.seen_through(searched.disparity, points)]
             self.map.points.note_seen_through(gone)
-        if self.session.join(keyframe, images):
-            keyframe = self.map.keyframes[-1]
+        if self.session.join(keyframe, images):  # whose features without points are gone
+            uv_px, keyframe = uv_px[keyframe.point_id != NO_POINT], self.map.keyframes[-1]
         else:
             self.back_end.take_in(keyframe, images, self.sensors.up_world)
         self.front_end.continue_from(images, keyframe, uv_px)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.geometry import invert, transform_points
 from segfloor_ros.core.plugins.assembly import equipped_slam
 from segfloor_ros.core.slam.session import SessionState
 from segfloor_ros.core.slam.settings import StereoSlamSettings
@@ -70,6 +70,32 @@ def test_keyframes_of_a_submap_are_published_in_the_map(merged):
         row = np.searchsorted(keyframe.cloud.point_id, keyframe.features.point_id[known])
         xyz = keyframe.features.xyz_map[known]
         np.testing.assert_array_equal(keyframe.cloud.xyz_map[row], xyz)
+
+
+class CoveredRoom(StereoRoom):
+    """Seen by a pair whose right eye is covered in part: features there have no disparity."""
+
+    def frame(self, *args, **more):
+        frame = super().frame(*args, **more)
+        frame.right[:, : CAMERA.width // 3] = 90
+        return frame
+
+
+@pytest.mark.slow
+def test_features_of_the_keyframe_that_joins_a_map_are_where_their_points_are_seen():
+    slam, poses = equipped_slam(CAMERA, SETTINGS, MOUNT), KNOWN + BEHIND + TURN + ON
+    batches = drive(slam, poses, room=CoveredRoom())
+    held = [len(batch) for batch in batches].index(0)
+    keyframes = [r.keyframe for batch in batches[held:] for r in batch if r.keyframe]
+    assert len(keyframes) > 4
+    for keyframe in keyframes:
+        features = keyframe.features
+        assert len(features.uv_px) == len(features.point_id) == len(features.xyz_map)
+        known = features.point_id >= 0
+        T_left_map = invert(keyframe.T_map_base @ MOUNT.T_base_left)
+        seen = CAMERA.project(transform_points(T_left_map, features.xyz_map[known]))[:, :2]
+        off_px = np.linalg.norm(seen - features.uv_px[known], axis=1)
+        assert np.median(off_px) < 1.0 and np.percentile(off_px, 90) < 4.0
 
 
 def test_the_edges_between_merged_maps_are_where_their_keyframes_stand(merged):
