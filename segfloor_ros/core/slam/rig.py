@@ -155,7 +155,7 @@ class RollingShutter:
 
     def __init__(self) -> None:
         self.seconds, self.expected = 0.0, AT_ONCE
-        self._keyframes, self._of_map = 0, np.zeros((2, 6))
+        self._of_map: Array = np.zeros((3, 6))
         self._sums = np.array([READOUT_S**-2, 0.0, 0.0, 1.0])
 
     def expect(self, velocity: Array, variance: Array) -> None:
@@ -164,21 +164,20 @@ class RollingShutter:
 
     def see_keyframe(self, velocity: Array) -> None:
         """Note with which velocity (6,) a keyframe was taken."""
-        self._keyframes = min(self._keyframes + 1, LOCAL_KEYFRAMES)
-        seen = np.stack([velocity, self.seconds * velocity])
-        self._of_map += (seen - self._of_map) / self._keyframes
+        # Their number, velocities, and what they were freed of, of the latest ones most.
+        seen = np.stack([np.ones(6), velocity, self.seconds * velocity])
+        self._of_map += seen - self._of_map / LOCAL_KEYFRAMES
 
     def learn(self, seen: Readout, velocity: Array) -> None:
         """Take in what an image showed of the twist, and the velocity (6,) there."""
         if not self._of_map.any():
-            self._of_map[0] = velocity
-        velocity_of_map, freed = self._of_map
+            self._of_map[:2] = np.ones(6), velocity
+        velocity_of_map, freed = self._of_map[1:] / self._of_map[0]
         change = velocity - velocity_of_map
         certainty, known = 1 / seen.variance, 1 / self.expected.variance
         information = np.maximum(certainty - known, SMALLEST)
-        measured = (certainty * seen.twist - known * self.expected.twist) / information
-        # Keyframes are freed of the twist as far as it was known.
-        measured -= freed
+        # Keyframes are freed of the twist as far as it was known when they were made.
+        measured = (certainty * seen.twist - known * self.expected.twist) / information - freed
         weight = 1 / (1 / information + MISFIT**2)
         self._sums += *(weight @ np.stack([change**2, change * measured, measured**2], axis=1)), 6
         total, by_time, squared, count = self._sums

@@ -29,8 +29,7 @@ from segfloor_ros.core.timing import timed
 
 HALF_PATCH_PX = SIDE_PX // 2
 STEPS, SETTLED_PX = 4, 0.02
-"""Gauss-Newton steps, and the length of one after which the next would change nothing that counts:
-noise of the template makes each a half or more of what is missing."""
+"""Gauss-Newton steps, and the length of one after which the next would change nothing."""
 
 AFFINE_SIGMA = 0.3
 """Prior deviation of the affine part, px per px; the floor under a low camera reaches 0.5."""
