@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from segfloor_ros.core.slam.tracking import patch_alignment
+from segfloor_ros.core.slam.tracking.images import smooth
 from segfloor_ros.core.slam.tracking.patch_alignment import (
     _remap,
     align_patches,
@@ -15,9 +17,9 @@ from segfloor_ros.core.slam.tracking.patch_alignment import (
 class Texture:
     """A sum of waves: grey levels are known exactly at any position, without interpolation."""
 
-    def __init__(self, seed=0):
+    def __init__(self, seed=0, waves=0.25):
         rng = np.random.default_rng(seed)
-        self._waves = rng.normal(scale=0.25, size=(80, 2))
+        self._waves = rng.normal(scale=waves, size=(80, 2))
         self._phases = rng.uniform(0, 2 * np.pi, 80)
 
     def __call__(self, u, v):
@@ -81,6 +83,22 @@ def test_follows_a_zoom():
     found = align_patches(sample_patches(image, uv), larger, truth + 0.5, np.full(len(uv), 1.3))
     assert found.sound.mean() > 0.9
     assert np.percentile(np.abs(found.uv_px - truth)[found.sound], 90) < 0.15
+
+
+def test_weak_texture_in_as_much_noise_is_found_and_not_held_back() -> None:
+    """Where a search starts, a patch with the slopes of its noise seems to lie."""
+    rng, texture, uv = np.random.default_rng(0), Texture(6, waves=0.5), grid_of_features(11)
+    shift = np.array([1.2, -0.8])
+    images = [texture.image(), warp(texture, lambda u, v: u - shift[0], lambda u, v: v - shift[1])]
+    weak = [128 + 3.0 / image.std() * (image - 128) for image in images]
+    noisy = [np.rint(image + rng.normal(0, 3.0, image.shape)).astype(np.uint8) for image in weak]
+    left, moved = map(smooth, noisy)
+    found = align_patches(sample_patches(left, uv), moved, uv, np.ones(len(uv)))
+    assert found.sound.mean() > 0.5
+    error = (found.uv_px - uv - shift)[found.sound]
+    assert np.linalg.norm(np.median(error, axis=0)) < 0.2 * np.linalg.norm(shift)
+    squared = (error / found.sigma_px[found.sound]) ** 2
+    assert 0.3 < np.median(squared.sum(axis=1)) / chi2.median(2) < 2.0
 
 
 def test_a_patch_of_something_else_is_not_sound():
