@@ -38,9 +38,6 @@ GREY_NOISE = 2.0
 """Standard deviation of a grey level that the camera alone explains; a lower residual is luck, and
 an image that varies by less shows nothing."""
 
-SHARED_PX2 = 4 * math.pi * BLUR_PX**2
-"""Pixels of a smoothed image that have the noise of one in common."""
-
 ALIGNED_PX = 2.0
 """From so far away a patch is brought to where it lies, by no more than half of it in one step."""
 
@@ -136,7 +133,7 @@ def align_patches(
         if not still.any():
             break
         fit, moving = fit.take(still), moving[still]
-    level = np.maximum(SHARED_PX2 * noise, GREY_NOISE**2) * of_level
+    level = np.maximum(noise, GREY_NOISE**2) * of_level
     sigma: Array = np.zeros((2, count))
     variance = np.maximum(np.einsum('aan->an', inverse)[::3], known) * level
     sigma[:axes] = zoom * np.sqrt(np.maximum(variance, 0.0))
