@@ -173,7 +173,7 @@ def test_the_next_image_is_expected_to_be_bent_by_the_velocity() -> None:
 READOUT = 0.6
 """Of the time between two images: 20 ms of 33."""
 
-BANDS, FRAMES = 12, 26
+BANDS, FRAMES = 12, 40
 """Bands in which a picture is drawn, each from where the camera is meanwhile; and pictures."""
 
 
