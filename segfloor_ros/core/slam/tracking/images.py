@@ -41,9 +41,8 @@ SIDE_PX = 11
 """Of the patch around a pixel: small enough to be flat, large enough to be distinct."""
 
 BLUR_PX = 0.7
-"""Scale of the slopes that patches are aligned by: noise has a third of its slopes left, and nearly
-all that a lens lets through stays.
-"""
+"""Scale of the slopes that patches are aligned by: of those of noise a third is left, and most of
+what a lens lets through."""
 
 SMALL_WIDTH_PX = 320
 """Width of a shrunk image: for optical flow; half of it shows what moves, a quarter turns."""
