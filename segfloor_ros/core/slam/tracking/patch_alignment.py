@@ -23,7 +23,6 @@ from segfloor_ros.core.camera.pixels import SUBPIXEL, disparity_at
 from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.slam.rig import MAX_DISPARITY_SHARE, SAME_PX, Observations
-from segfloor_ros.core.slam.thresholds import MAJORITY
 from segfloor_ros.core.slam.tracking.images import BLUR_PX, SIDE_PX, SMALL_WIDTH_PX, Images
 from segfloor_ros.core.timing import timed
 
@@ -138,7 +137,8 @@ def align_patches(
     variance = np.maximum(np.einsum('aan->an', inverse)[::3], known) * level
     sigma[:axes] = zoom * np.sqrt(np.maximum(variance, 0.0))
     offset = warp[:, 2] - start_uv_px.T
-    sound = (np.abs(offset) < ALIGNED_PX).all(axis=0) & (noise < MAJORITY * contrast)
+    # Smoothed noise alone is explained by a half now and then.
+    sound = (np.abs(offset) < ALIGNED_PX).all(axis=0) & (noise < contrast / 4)
     sound &= (np.abs(last) < MIN_SIGMA_DISPARITY).all(axis=0)
     return Alignment(start_uv_px + offset.T, sigma.T, sound)
 

@@ -163,7 +163,7 @@ def test_points_of_what_has_left_leave_the_map():
 
 def walking_into_the_image(index):
     """From the left through the image, 0.4 m ahead of the camera, for four frames."""
-    return (0.03 * index + 0.4, -0.25 + 0.12 * (index - 20)) if 20 <= index <= 23 else None
+    return (0.03 * index + 0.4, -0.28 + 0.12 * (index - 20)) if 20 <= index <= 23 else None
 
 
 @pytest.mark.slow
