@@ -111,7 +111,6 @@ class DisparityOffset:
         parts = 1 if len(numbers) == 2 else 3
         self.estimate.value_px[:parts] = numbers[:parts]
         self.estimate.information[:parts, :parts] = numbers[parts:].reshape(parts, parts)
-        np.linalg.cholesky(self.estimate.information)  # raises where it is none
         return self
 
     def learn(self, left: OffsetEstimate) -> None:
